@@ -16,6 +16,7 @@ from tk.io.results.data import Result
 from tk.kernels.edge_search import search_edges
 from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.raycast import Cast
+from tk.kernels.silhouette import descend, normal_equations
 from tk.model.body.limb_candidates import limbs_of
 from tk.model.cues.edge_term import THRESHOLD, ContourTerm
 from tk.model.cues.objective import COVERAGE_VOXELS, BodyObjective
@@ -123,13 +124,13 @@ def silhouette_stages(
 
     def fit(start: Float, pyramid: Pyramid) -> Float:
         return gauss_newton.minimise(
-            lambda states, scale, steps: views.descend(body.arrays, pyramid, states, scale, LINE_SEARCH, steps),
+            lambda states, scale, steps: descend(body.arrays, views.at(pyramid, scale), states, LINE_SEARCH, steps),
             start[None], *limits, SOLVER,
         )  # fmt: skip
 
     def equations(scale: int, window_px: float) -> float:
         search = replace(LINE_SEARCH, window_px=window_px)
-        return median_ms(lambda: views.equations(body.arrays, last, pose, scale, search))
+        return median_ms(lambda: normal_equations(body.arrays, views.at(last, scale), pose, search))
 
     window = LINE_SEARCH.window_px
     found = [Stage("masks cleaned, scales", median_ms(lambda: views.pyramid(masks[-1], scales, True)), {})]

@@ -171,12 +171,16 @@ def standing(**angles):
     return pose
 
 
+def seen(masks):
+    return silhouette.Silhouettes(VIEWS.cameras, VIEWS.sizes, masks, 1.0)
+
+
 def edgels_of(body, masks, pose, settings, dtype=np.float64):
-    return silhouette.find_edgels(body.pack(dtype), VIEWS.cameras, VIEWS.sizes, masks, 1.0, pose, settings)
+    return silhouette.find_edgels(body.pack(dtype), seen(masks), pose, settings)
 
 
 def equations_of(body, masks, poses, settings, dtype=np.float64):
-    return silhouette.normal_equations(body.pack(dtype), VIEWS.cameras, VIEWS.sizes, masks, 1.0, poses, settings)
+    return silhouette.normal_equations(body.pack(dtype), seen(masks), poses, settings)
 
 
 POSE = standing(hip_l_pitch=-0.5, knee_l_flexion=0.6, hip_r_pitch=0.2, torso_yaw=0.3)
@@ -209,8 +213,7 @@ STEPS = NewtonSteps(
 
 
 def descent_of(masks, poses, steps):
-    dtype = np.float64
-    return silhouette.descend(BODY.pack(dtype), VIEWS.cameras, VIEWS.sizes, masks, 1.0, poses, PLAIN, steps)
+    return silhouette.descend(BODY.pack(np.float64), seen(masks), poses, PLAIN, steps)
 
 
 def test_descent_is_single_steps_one_after_another():

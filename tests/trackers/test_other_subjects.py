@@ -7,6 +7,7 @@ import numpy as np
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, STATURE, errors, observe, walk
 from tk.kernels.mask_values import OTHERS
+from tk.kernels.silhouette import find_edgels
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Views, draw_silhouettes
 from tk.settings import SilhouetteSettings
@@ -43,7 +44,7 @@ def test_no_contour_is_searched_at_another_person() -> None:
         pyramid = views.pyramid(masks[0], 3, True)
         assert all((level == OTHERS).any() == (masks is MARKED) for level in pyramid.masks)
         for scale in range(3):
-            edgels = views.edgels(BODY, pyramid, POSES[0], scale, LINE_SEARCH)
+            edgels = find_edgels(BODY.arrays, views.at(pyramid, scale), POSES[0], LINE_SEARCH)
             found = (edgels.pixel + edgels.distance[:, None] * edgels.normal)[edgels.view == 0, 1]
             assert len(found) > 10
             lowest.append(found.max() - border)

@@ -54,6 +54,17 @@ COST, FOUND, ALL, STEPS, GRADIENT = range(5)
 _NO_REGIONS = Regions(np.zeros((1, 1, 1, 3), np.uint8), np.zeros((1, COLOR_BINS), np.float32), 0.0)
 
 
+class Silhouettes(NamedTuple):
+    """Masks of V views at one scale."""
+
+    cameras: NDArray[np.floating]  # (V, 22) of :func:`tk.kernels.projection.pack_cameras`, of the full image
+    sizes: NDArray[np.integer]  # (V, 2) width and height of each camera's mask
+    # (V, H, W), between 0 and 255 where a pixel is partly covered, :data:`~tk.kernels.mask_values.OTHERS` where it
+    # shows another person; or (B V, H, W), each pose's own
+    masks: NDArray[np.uint8]
+    scale: float  # pixels of the full image in one of this scale (1, 2, …)
+
+
 class NormalEquations(NamedTuple):
     """The normal equations of B poses, distances in pixels of the full picture."""
 
@@ -331,10 +342,7 @@ class Descent(NamedTuple):
 
 def _launch(
     body: ConeArrays,
-    cameras: NDArray[np.floating],
-    sizes: NDArray[np.integer],
-    masks: NDArray[np.uint8],
-    scale: float,
+    seen: Silhouettes,
     poses: NDArray[np.floating],
     settings: SearchSettings,
     regions: Regions | None,
@@ -347,20 +355,20 @@ def _launch(
     dtype = body.tree.dtype
     state = np.array(poses, np.float64)
     B, D = state.shape
-    V, Q, P = len(cameras), len(body.curves), len(body.parts)
+    V, Q, P = len(seen.cameras), len(body.curves), len(body.parts)
     regions = regions or _NO_REGIONS
-    if len(masks) not in (V, B * V):
-        raise ValueError(f"{len(masks)} masks of {V} views: one set, or one for each frame of the {B} poses")
+    if len(seen.masks) not in (V, B * V):
+        raise ValueError(f"{len(seen.masks)} masks of {V} views: one set, or one for each frame of the {B} poses")
     sums, hessian = np.empty((B, GRADIENT + D)), np.zeros((B, D, D))
     samples = np.zeros((B * V * Q, settings.most_samples, _EXPORT) if export else (1, 1, _EXPORT), dtype)
     _descent_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
         *body,
-        np.ascontiguousarray(cameras, dtype),
-        np.ascontiguousarray(sizes, np.int32),
-        np.ascontiguousarray(masks),
+        np.ascontiguousarray(seen.cameras, dtype),
+        np.ascontiguousarray(seen.sizes, np.int32),
+        np.ascontiguousarray(seen.masks),
         regions.image,
         regions.log_likelihood,
-        _numbers(settings, scale, regions.weight, export, dtype),
+        _numbers(settings, seen.scale, regions.weight, export, dtype),
         *(newton or _no_steps(D)),
         spread_of(B),
         state,
@@ -399,10 +407,7 @@ def _scratch(B: int, V: int, Q: int, D: int, P: int, dtype: np.dtype) -> tuple[N
 
 def normal_equations(
     body: ConeArrays,
-    cameras: np.ndarray,
-    sizes: np.ndarray,
-    masks: np.ndarray,
-    scale: float,
+    seen: Silhouettes,
     poses: np.ndarray,
     settings: SearchSettings,
     regions: Regions | None = None,
@@ -411,11 +416,7 @@ def normal_equations(
 
     Args:
         body: the cone body; its real type is the precision of the computation.
-        cameras: (V, 22) rows of :func:`tk.kernels.projection.pack_cameras`, of the full picture.
-        sizes: (V, 2) width and height of each camera's mask at this scale.
-        masks: (V, H, W) uint8 at this scale, values between 0 and 255 where a pixel is partly covered,
-            :data:`~tk.kernels.mask_values.OTHERS` where it shows another person; or (B V, H, W), pose b's own.
-        scale: pixels of the full picture in one of this scale (1, 2, …).
+        seen: the silhouettes.
         poses: (B, D).
         settings: see :class:`SearchSettings`.
         regions: colours of the parts, for contours inside the silhouette; None ignores colours.
@@ -423,24 +424,21 @@ def normal_equations(
     Raises:
         ValueError: the masks are neither of one frame nor of one for each pose.
     """
-    descent, sums, _ = _launch(body, cameras, sizes, masks, scale, poses, settings, regions)
+    descent, sums, _ = _launch(body, seen, poses, settings, regions)
     weight = sums[:, ALL]
-    seen = weight > 0
-    safe = np.where(seen, weight, 1.0)
+    known = weight > 0
+    safe = np.where(known, weight, 1.0)
     return NormalEquations(
         hessian=descent.hessian,
         gradient=sums[:, GRADIENT:],
-        cost=np.where(seen, sums[:, COST] / safe, np.inf),
-        found=np.where(seen, sums[:, FOUND] / safe, 0.0),
+        cost=np.where(known, sums[:, COST] / safe, np.inf),
+        found=np.where(known, sums[:, FOUND] / safe, 0.0),
     )
 
 
 def descend(
     body: ConeArrays,
-    cameras: np.ndarray,
-    sizes: np.ndarray,
-    masks: np.ndarray,
-    scale: float,
+    seen: Silhouettes,
     poses: np.ndarray,
     settings: SearchSettings,
     newton: NewtonSteps,
@@ -453,20 +451,17 @@ def descend(
     Args:
         newton: the steps; other arguments as for :func:`normal_equations`.
     """
-    return _launch(body, cameras, sizes, masks, scale, poses, settings, regions, newton=newton)[0]
+    return _launch(body, seen, poses, settings, regions, newton=newton)[0]
 
 
 def find_edgels(
     body: ConeArrays,
-    cameras: np.ndarray,
-    sizes: np.ndarray,
-    masks: np.ndarray,
-    scale: float,
+    seen: Silhouettes,
     pose: np.ndarray,
     settings: SearchSettings,
 ) -> Edgels:
     """Return the edgels that one pose (D,) finds; arguments as for :func:`normal_equations`."""
-    _, _, samples = _launch(body, cameras, sizes, masks, scale, pose[None], settings, None, export=True)
+    _, _, samples = _launch(body, seen, pose[None], settings, None, export=True)
     Q = len(body.curves)
     task, index = np.nonzero(samples[:, :, 0])
     chosen = samples[task, index].astype(np.float64)

@@ -18,6 +18,7 @@ from tk.errors import CaptureError
 from tk.kernels.cones import CONE, ELLIPSOID
 from tk.kernels.line_search import SearchSettings
 from tk.kernels.raycast import Cast
+from tk.kernels.silhouette import descend, normal_equations
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_fit import INFORMATIVE_FRAMES, STATURE_DEVIATION, fit_body
@@ -162,7 +163,7 @@ class ContourTracker:
         empty = np.zeros((len(self.views.rig), *self.views.rig.frame_shape), np.uint8)
         seen = self.views.pyramid(empty, 1, False)
         pose = np.zeros((1, len(body.skeleton.names)))
-        self.views.equations(body.arrays, seen, pose, 0, self.line_search)
+        normal_equations(body.arrays, self.views.at(seen, 0), pose, self.line_search)
         Evidence.of(self.screen, empty).cast(body, pose)
 
     # --- initialisation (silhouette paper, section 4.6) ---------------------------------------------------------
@@ -397,8 +398,8 @@ class ContourTracker:
         arrays, free = (limb.arrays, limb.dofs) if limb else (body.arrays, None)
         regions = None if images is None else self.colors.regions(images)
         return gauss_newton.minimise(
-            lambda states, scale, steps: self.views.descend(
-                arrays, pyramid, states, scale, self.line_search, steps, regions
+            lambda states, scale, steps: descend(
+                arrays, self.views.at(pyramid, scale), states, self.line_search, steps, regions
             ),
             poses,
             free,

@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.kernels.silhouette import normal_equations
 from tk.model.body.cone_body import ConeBody
 from tk.model.body.joint_sigma import VIEW_M, contour_variance, directions, posture_variance, view_variance
 from tk.model.body.limb_candidates import Limb
@@ -380,7 +381,7 @@ class RegionTracker(ContourTracker):
         _, met = evidence.cast(self.body, best, export=True)
         assert met is not None
         regions = None if images is None else self.colors.regions(images)
-        here = self.views.equations(self.body.arrays, pyramid, best, 0, self.line_search, regions)
+        here = normal_equations(self.body.arrays, self.views.at(pyramid, 0), best, self.line_search, regions)
         return _Look(met.label[0], here.hessian[0], evidence.residual(met.label[0]))
 
     def _sigma(self, pose: Float, look: _Look) -> Float:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.line_search import SearchSettings
-from tk.kernels.silhouette import Edgels
+from tk.kernels.silhouette import Edgels, find_edgels
 from tk.model.block_least_squares import Equations
 from tk.model.body.body_parameters import BodyFamily
 from tk.model.body.skeleton import SEGMENTS, Skeleton
@@ -145,7 +145,7 @@ class ContourBundle:
                     tuple(level[own] for level in frame.pyramid.masks), tuple(s[own] for s in frame.pyramid.sizes)
                 )
                 here = pose + offsets[c] * frame.velocity
-                edgels = view.edgels(body, pyramid, here, scale, self._settings)
+                edgels = find_edgels(body.arrays, view.at(pyramid, scale), here, self._settings)
                 if together and self.parameters:
                     found += [Contours(f, k, here, edgels.of_view(k)) for k in range(len(state.rig))]
                 else:

@@ -9,14 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels import silhouette as kernels
-from tk.kernels.cone_arrays import ConeArrays
-from tk.kernels.line_search import Regions, SearchSettings
 from tk.kernels.mask_values import OTHERS
-from tk.kernels.newton import NewtonSteps
 from tk.kernels.projection import pack_cameras
 from tk.kernels.raycast import cast
-from tk.kernels.silhouette import Descent, Edgels, NormalEquations
+from tk.kernels.silhouette import Silhouettes
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.camera import Rig
 from tk.model.masks.regions import clean_by_area
@@ -93,39 +89,9 @@ class Views:
                 levels[k] = _marked(level, others, 2**k)
         return Pyramid(tuple(levels), tuple(sizes))
 
-    def equations(
-        self,
-        body: ConeArrays,
-        pyramid: Pyramid,
-        poses: Float,
-        scale: int,
-        settings: SearchSettings,
-        regions: Regions | None = None,
-    ) -> NormalEquations:
-        """Return normal equations of poses (B, D) at a scale's index. The pyramid is of one frame, or each pose has its
-        own."""
-        return kernels.normal_equations(body, *self._at(pyramid, scale), poses, settings, regions)
-
-    def descend(
-        self,
-        body: ConeArrays,
-        pyramid: Pyramid,
-        poses: Float,
-        scale: int,
-        settings: SearchSettings,
-        newton: NewtonSteps,
-        regions: Regions | None = None,
-    ) -> Descent:
-        """Return poses (B, D) after Gauss-Newton steps at a scale's index; other arguments as of :meth:`equations`."""
-        return kernels.descend(body, *self._at(pyramid, scale), poses, settings, newton, regions)
-
-    def edgels(self, body: ConeBody, pyramid: Pyramid, pose: Float, scale: int, settings: SearchSettings) -> Edgels:
-        """Return the edgels that a pose (D,) finds at a scale's index."""
-        return kernels.find_edgels(body.arrays, *self._at(pyramid, scale), pose, settings)
-
-    def _at(self, pyramid: Pyramid, scale: int) -> tuple[NDArray[np.float32], NDArray[np.int32], Masks, float]:
-        """Return the cameras, and the pyramid's scale as the kernels take it."""
-        return self._cameras32, pyramid.sizes[scale], pyramid.masks[scale], 2.0**scale
+    def at(self, pyramid: Pyramid, scale: int) -> Silhouettes:
+        """Return a scale of a pyramid, by its index, as the kernels take it."""
+        return Silhouettes(self._cameras32, pyramid.sizes[scale], pyramid.masks[scale], 2.0**scale)
 
 
 def _halve(levels: Sequence[Masks], crop: tuple[slice, slice]) -> None:
