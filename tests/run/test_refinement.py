@@ -25,6 +25,7 @@ from tk.io.toml import load_toml
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
+from tk.model.cameras.bundle import TrackedPoses
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.refinement import turn_between
 from tk.model.masks.silhouettes import draw_silhouettes
@@ -101,9 +102,9 @@ def test_late_videos_are_tracked_again(tiny: Path, tmp_path: Path, monkeypatch: 
     """With invented delays: which frames are tracked again, and that every frame keeps its row."""
     asked: list[np.ndarray] = []
 
-    def made_up(tracker: Any, agreement: Any, store: Any, frames: Any, *_: Any) -> Any:
+    def made_up(tracker: Any, agreement: Any, store: Any, tracked: Any, *_: Any) -> Any:
         late = np.array([0, 0, 1, -1])
-        return tracker, retimed(store, frames, late), late.astype(float)
+        return tracker, retimed(store, tracked.frames, late), late.astype(float)
 
     read = Capture.frames
 
@@ -148,7 +149,8 @@ def test_videos_that_are_late_by_more_than_edges_reach_are_found(late: list[int]
     drawn[:, 3, ::3] = 0  # this camera's masks are poor
     drawn[away] = 0
     seen = np.array([[drawn[min(max(k + n, 0), 23), c] for c, n in enumerate(late)] for k in frames])
-    found = whole_delays(body, rig, seen.__getitem__, frames, poses, seen.any(axis=(2, 3)).all(axis=1))
+    tracked = TrackedPoses(frames, poses, seen.any(axis=(2, 3)).all(axis=1))
+    found = whole_delays(body, rig, seen.__getitem__, tracked)
     assert found.tolist() == late
 
 

@@ -18,6 +18,7 @@ from tk.io.results.revision import revise_result
 from tk.io.results.status import Status
 from tk.kernels.projection import pack_cameras
 from tk.model.body.cone_body import ConeBody
+from tk.model.cameras.bundle import TrackedPoses
 from tk.model.masks.image_health import described
 from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
@@ -121,7 +122,8 @@ def _finish(
                 for observation, _ in observations.frames(min(missing), max(missing) + 1):
                     masks.put(observation.index, again.cleaned(again.without_foreign(observation).masks))
         _LOG.info("second pass: comparing the cameras")
-        agreement = compare_cameras(again, masks, result.frames, poses, ~lost)
+        tracked = TrackedPoses(result.frames, poses.copy(), ~lost)
+        agreement = compare_cameras(again, masks, tracked)
         if apart := "" if agreement is None else agreement.contradiction:
             note(f"{apart}: all frames are suspect")
             unclear = ~lost
@@ -129,7 +131,7 @@ def _finish(
             late = np.round((cameras.time_offset_s - plan.source.time_offset_s) * fps).astype(np.int64)
             again, masks = again.with_cameras(cameras.rig), retimed(masks, result.frames, late)
         elif agreement is not None and plan.settings.refine and not apart:
-            refined = refine_if_inconsistent(again, agreement, masks, result.frames, poses, ~lost, note)
+            refined = refine_if_inconsistent(again, agreement, masks, tracked, note)
             if refined is not None:
                 again, masks, offsets = refined
                 cameras = UsedCameras(again.rig, cameras.time_offset_s + offsets / fps)

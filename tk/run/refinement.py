@@ -19,7 +19,7 @@ from tk.io.results.reader import read_result
 from tk.kernels.mask_values import OTHERS
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.agreement import LATE_FRAMES, CameraAgreement, camera_agreement
-from tk.model.cameras.bundle import choose_frames
+from tk.model.cameras.bundle import TrackedPoses, choose_frames
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.refinement import SCALES, Refined, RefinementSettings, refine_cameras
 from tk.model.cameras.tracker_frame import TrackerFrame
@@ -138,9 +138,8 @@ def refine_capture(
     with open_observations(setup, source, config, note, keep_images=False) as observations:
         for observation, _ in observations.frames(int(found.frames.min()), int(found.frames.max()) + 1):
             store.put(observation.index, observation.masks)
-    body, poses = tracked[0].standing("z"), world.poses_in(tracked[1])
-    usable = found.has_pose
-    done = refine_rig(body, world.rig, store, found.frames, poses, usable, how)
+    poses = TrackedPoses(found.frames, world.poses_in(tracked[1]), found.has_pose)
+    done = refine_rig(tracked[0].standing("z"), world.rig, store, poses, how)
     if done is None:
         raise CaptureError(
             f"{result}: has too few consecutive tracked frames to refine {capture.path}; {FEWEST} are needed"
@@ -155,13 +154,11 @@ def refine_rig(
     body: ConeBody,
     rig: Rig,
     store: MaskStore,
-    frames: NDArray[np.int64],
-    poses: Float,
-    usable: NDArray[np.bool_],
+    tracked: TrackedPoses,
     how: RefinementSettings | None = None,
     late: NDArray[np.int64] | None = None,
 ) -> Refinement | None:
-    """Refine cameras by poses (F, D) of frames (F,) whose masks are in the store; None if too few are usable.
+    """Refine cameras by the poses of frames whose masks are in the store; None if too few are usable.
 
     Body, cameras and poses, and the returned cameras, are in a world in which z is up. If a video is late by whole
     frames, the refinement is repeated with its other frames until less than half a frame of delay remains.
@@ -172,10 +169,7 @@ def refine_rig(
     done: Refined | None = None
     count = 0
     for _ in range(_SHIFTS):
-        chosen = choose_frames(
-            lambda frame, camera: masks(frame)[camera],
-            Views(rig), body.skeleton, frames, poses, usable, FRAMES, SCALES, True, late,
-        )  # fmt: skip
+        chosen = choose_frames(masks, Views(rig), body.skeleton, tracked, FRAMES, SCALES, True, late)
         if len(chosen) < FEWEST:
             break
         count = len(chosen)
@@ -193,27 +187,12 @@ def refine_rig(
     return None if done is None else Refinement(done, rig.names, count)
 
 
-def compare_cameras(
-    tracker: TwoPassTracker,
-    store: MaskStore,
-    frames: NDArray[np.int64],
-    poses: Float,
-    usable: NDArray[np.bool_],
-) -> CameraAgreement | None:
+def compare_cameras(tracker: TwoPassTracker, store: MaskStore, tracked: TrackedPoses) -> CameraAgreement | None:
     """Return how the cameras differ about the tracked person; None if too few frames are usable. Arguments as of
     :func:`refine_if_inconsistent`."""
+    tracked = replace(tracked, poses=tracker.world.poses_in(tracked.poses))
     masks = lru_cache(16)(store.get)
-    chosen = choose_frames(
-        lambda frame, camera: masks(frame)[camera],
-        tracker.views,
-        tracker.body.skeleton,
-        frames,
-        tracker.world.poses_in(poses),
-        usable,
-        AGREEMENT_FRAMES,
-        1,
-        False,
-    )
+    chosen = choose_frames(masks, tracker.views, tracker.body.skeleton, tracked, AGREEMENT_FRAMES, 1, False)
     return camera_agreement(tracker.body, tracker.world.rig, chosen) if len(chosen) >= FEWEST else None
 
 
@@ -221,9 +200,7 @@ def refine_if_inconsistent(
     tracker: TwoPassTracker,
     agreement: CameraAgreement,
     store: MaskStore,
-    frames: NDArray[np.int64],
-    poses: Float,
-    usable: NDArray[np.bool_],
+    tracked: TrackedPoses,
     note: Note,
 ) -> tuple[TwoPassTracker, MaskStore, Float] | None:
     """Refine the cameras if they disagree about the tracked person; None if they agree, or refinement does not help.
@@ -232,7 +209,7 @@ def refine_if_inconsistent(
         tracker: after the first pass over the frames.
         agreement: of :func:`compare_cameras`.
         store: the frames' masks.
-        frames, poses, usable: (F,), (F, D), (F,) of :func:`refine_rig`; the poses are in the capture's world.
+        tracked: poses in the capture's world.
         note: receives a message about the refined cameras.
 
     Returns:
@@ -240,11 +217,11 @@ def refine_if_inconsistent(
         frames.
     """
     world = tracker.world
-    poses = world.poses_in(poses)
-    late = whole_delays(tracker.body, world.rig, lru_cache(16)(store.get), frames, poses, usable)
+    tracked = replace(tracked, poses=world.poses_in(tracked.poses))
+    late = whole_delays(tracker.body, world.rig, lru_cache(16)(store.get), tracked)
     if not (late.any() or agreement.inconsistent.any() or agreement.late.any()):
         return None
-    done = refine_rig(tracker.body, world.rig, store, frames, poses, usable, late=late)
+    done = refine_rig(tracker.body, world.rig, store, tracked, late=late)
     if done is None:
         return None
     refined = done.refined
@@ -259,24 +236,19 @@ def refine_if_inconsistent(
         f"{after:.2f}; {', '.join([f'{names[worst]} is turned most, by {refined.turn_deg[worst]:.2f}°', *delays])} "
         "(refine = false keeps them)"
     )
-    fresh = tracker.with_cameras(world.rig_out(refined.rig))
-    return fresh, retimed(store, frames, np.round(refined.offset_frames).astype(np.int64)), refined.offset_frames
+    synchronised = retimed(store, tracked.frames, np.round(refined.offset_frames).astype(np.int64))
+    return tracker.with_cameras(world.rig_out(refined.rig)), synchronised, refined.offset_frames
 
 
 def whole_delays(
-    body: ConeBody,
-    rig: Rig,
-    masks: Callable[[int], NDArray[np.uint8]],
-    frames: NDArray[np.int64],
-    poses: Float,
-    usable: NDArray[np.bool_],
+    body: ConeBody, rig: Rig, masks: Callable[[int], NDArray[np.uint8]], tracked: TrackedPoses
 ) -> NDArray[np.int64]:
     """Return (C,) whole frames by which each video is late: with the masks of so many frames before, the body explains
     a camera that it otherwise explains worse than the others. Arguments as of :func:`refine_rig`."""
     late = np.zeros(len(rig), np.int64)
-    known = set(frames.tolist())
+    frames, known = tracked.frames, set(tracked.frames.tolist())
     shifts = range(-LARGEST_DELAY, LARGEST_DELAY + 1)
-    rows = np.flatnonzero(usable & [all(frame - n in known for n in shifts) for frame in frames.tolist()])
+    rows = np.flatnonzero(tracked.usable & [all(frame - n in known for n in shifts) for frame in frames.tolist()])
     if not len(rows):
         return late
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, DELAY_FRAMES).round().astype(int))]
@@ -284,7 +256,7 @@ def whole_delays(
     sampled = cache(lambda frame: grid.sample(masks(frame)).copy())
     bodies = []
     for i in rows:
-        _, met = Evidence.of(grid, masks(int(frames[i]))).cast(body, poses[i][None], export=True)
+        _, met = Evidence.of(grid, masks(int(frames[i]))).cast(body, tracked.poses[i][None], export=True)
         assert met is not None
         bodies.append(met.label[0] > 0)
 

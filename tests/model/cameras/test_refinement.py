@@ -17,7 +17,7 @@ from tk.model.body.body_parameters import BodyFamily, shapes_of
 from tk.model.body.cone_body import SHAPE_NUMBERS, group_of
 from tk.model.cameras import refinement
 from tk.model.cameras.agreement import camera_agreement
-from tk.model.cameras.bundle import camera_rows, choose_frames, farthest
+from tk.model.cameras.bundle import TrackedPoses, camera_rows, choose_frames, farthest
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import closest_to_lines
 from tk.model.cameras.refinement import (
@@ -74,18 +74,15 @@ def in_time() -> MaskStore:
     return rendered()
 
 
+def tracked(poses: np.ndarray | None = None, usable: slice = slice(None)) -> TrackedPoses:
+    """All frames; only those of the slice are usable."""
+    sure = np.zeros(FRAMES, bool)
+    sure[usable] = True
+    return TrackedPoses(np.arange(FRAMES), motion() if poses is None else poses, sure)
+
+
 def frames(store: MaskStore, rig: Rig):
-    return choose_frames(
-        lambda k, c: store.get(k)[c],
-        Views(rig),
-        BODY.skeleton,
-        np.arange(FRAMES),
-        motion(),
-        np.ones(FRAMES, bool),
-        FRAMES,
-        1,
-        True,
-    )
+    return choose_frames(store.get, Views(rig), BODY.skeleton, tracked(), FRAMES, 1, True)
 
 
 def disturbed(camera: Camera, rng: np.random.Generator, deg: float = 0.25, metres: float = 0.01) -> Camera:
@@ -230,17 +227,14 @@ def test_focal_lengths_are_refined():
 @pytest.mark.parametrize("late", [(0, 0, 1, 0), (0, 0.4, 0, 0)])
 def test_delays_of_videos_are_estimated(late):
     store = rendered(late)
-    done = refine_rig(BODY, RIG, store, np.arange(FRAMES), motion(), np.ones(FRAMES, bool), QUICK)
+    done = refine_rig(BODY, RIG, store, tracked(), QUICK)
     assert done is not None
     np.testing.assert_allclose(done.refined.offset_frames, late, atol=0.12)
     assert (done.refined.offset_sigma_frames < 0.2).all()
 
 
 def test_too_few_usable_frames_give_none():
-    usable = np.zeros(FRAMES, bool)
-    usable[3:8] = True
-    args = (np.arange(FRAMES), motion(), usable, QUICK)
-    assert refine_rig(BODY, RIG, in_time(), *args) is None
+    assert refine_rig(BODY, RIG, in_time(), tracked(usable=slice(3, 8)), QUICK) is None
 
 
 def test_agreement_names_the_inconsistent_and_the_late_camera():
@@ -265,10 +259,7 @@ def test_two_cameras_of_which_one_is_turned_sideways_contradict_each_other(turne
     met = [closest_to_lines(wrong.centers, np.array(pair)) for pair in zip(*rays, strict=True)]
     poses = motion().copy()
     poses[:, [BODY.skeleton.names.index(f"torso_{axis}") for axis in "xyz"]] += np.array(met) - place
-    seen = choose_frames(
-        lambda k, c: in_time().get(k)[c],
-        Views(wrong), BODY.skeleton, np.arange(FRAMES), poses, np.ones(FRAMES, bool), FRAMES, 1, True,
-    )  # fmt: skip
+    seen = choose_frames(in_time().get, Views(wrong), BODY.skeleton, tracked(poses), FRAMES, 1, True)
     contradiction = camera_agreement(BODY, wrong, seen).contradiction
     assert ("larger than" in contradiction) == (turned_deg != 0), contradiction
 

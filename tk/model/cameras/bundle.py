@@ -54,6 +54,15 @@ CAMERA_PARAMETERS = {"shift": 2, "turn": 3, "move": 3, "focal": 1, "offset": 1}
 
 
 @dataclass(frozen=True)
+class TrackedPoses:
+    """Poses of a person in some frames of a recording."""
+
+    frames: NDArray[np.int64]  # (F,) number of each frame, ascending
+    poses: Float  # (F, D)
+    usable: NDArray[np.bool_]  # (F,) whether the pose is reliable
+
+
+@dataclass(frozen=True)
 class BundleFrame:
     """One frame of a bundle."""
 
@@ -260,12 +269,10 @@ def residual_px(contours: Sequence[Contours], count: int) -> Float:
 
 
 def choose_frames(
-    masks: Callable[[int, int], NDArray[np.uint8]],
+    masks: Callable[[int], NDArray[np.uint8]],
     views: Views,
     skeleton: Skeleton,
-    frames: NDArray[np.int64],
-    poses: Float,
-    usable: NDArray[np.bool_],
+    tracked: TrackedPoses,
     count: int,
     scales: int,
     cleaning: bool,
@@ -275,29 +282,27 @@ def choose_frames(
     them.
 
     Args:
-        masks: (H, W) of a frame and a camera.
+        masks: (C, H, W) of a frame.
         views: the C cameras.
         skeleton: of the body.
-        frames: (F,) source frame of each row.
-        poses: (F, D).
-        usable: (F,) bool, rows with a reliable pose.
+        tracked: the frames to choose from.
         count: largest number of frames.
         scales: of the pyramids.
         cleaning: whether the masks are cleaned first.
         late: (C,) whole frames by which a camera's video is late: its frame k - late goes with frame k of the other
             cameras. None: by none.
     """
-    C = len(views.rig)
-    late = np.zeros(C, np.int64) if late is None else late
-    known = {int(frame) for frame in frames}
+    frames, poses, usable = tracked.frames, tracked.poses, tracked.usable
+    delays = [0] * len(views.rig) if late is None else late.tolist()
+    known = set(frames.tolist())
     inner = np.zeros(len(frames), bool)
     inner[1:-1] = usable[:-2] & usable[1:-1] & usable[2:] & (frames[2:] - frames[:-2] == 2)
-    inner &= [all(int(frame) - int(n) in known for n in late) for frame in frames]
+    inner &= [all(frame - n in known for n in delays) for frame in frames.tolist()]
     rows = np.flatnonzero(inner)
     rows = rows[farthest(skeleton.joints(poses[rows]), count)]
     chosen = []
     for i in rows:
-        frame_set = np.stack([masks(int(frames[i] - late[c]), c) for c in range(C)])
+        frame_set = np.stack([masks(int(frames[i]) - n)[c] for c, n in enumerate(delays)])
         velocity = 0.5 * (poses[i + 1] - poses[i - 1])
         chosen.append(BundleFrame(views.pyramid(frame_set, scales, cleaning), poses[i], velocity))
     return chosen
