@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,9 +21,9 @@ from tk.model.body.angles import ANGLES
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.model.body.skeleton import SEGMENTS
+from tk.model.body.stored_body import body_values
 from tk.model.motion.derived import derive
 from tk.settings import Settings
-from tk.trackers.contour_tracker import ContourTracker
 
 LOST = (6, 7)
 NOTE = 'said </script><b>"loudly"</b> & more'
@@ -57,7 +56,7 @@ def complete_result(path: Path, capture_path: Path, count: int = FRAMES) -> Path
         }  # fmt: skip
 
     write_motion(
-        path, skeleton, poses, ContourTracker.model(cast(Any, SimpleNamespace(body=body))), row,
+        path, skeleton, poses, body_values(body), row,
         fps=capture.fps, up=capture.up, capture="made <up>", method="region",
         config_toml=settings_file.to_toml(Settings()), timing_stages=("decode", "optimise", "total"), sigma=True,
         residual_cameras=capture.rig.names, segment_names=SEGMENTS, feet=True,

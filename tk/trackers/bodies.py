@@ -15,7 +15,7 @@ from tk.io.toml import parse_toml, read_text
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.skeleton import convert_poses, skeleton_of_names
-from tk.trackers.contour_tracker import restore_body, restore_dimensions
+from tk.model.body.stored_body import restore_body, restore_dimensions
 
 
 def read_body(path: Path, up: str) -> ConeBody:
@@ -53,7 +53,7 @@ def read_body(path: Path, up: str) -> ConeBody:
 
 
 def body_and_poses(result: Result) -> tuple[ConeBody, NDArray[np.float64]] | None:
-    """The body that a result was tracked with, and its poses (F, D); None where it holds none.
+    """Return the body that a result was tracked with, and its poses (F, D); None if it stores no body.
 
     Angles that the result does not have are 0: the volumetric tracker has no ankles.
 

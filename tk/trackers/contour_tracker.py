@@ -5,27 +5,26 @@ masks → cleaned, scales → {contours → edgels along their normals → norma
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
-from tk.kernels.cones import CONE, ELLIPSOID
 from tk.kernels.line_search import SearchSettings
 from tk.kernels.raycast import Cast
 from tk.kernels.silhouette import descend, normal_equations
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_fit import INFORMATIVE_FRAMES, STATURE_DEVIATION, fit_body
-from tk.model.body.cone_body import ConeBody, ConePart, build_cone_body
+from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.initial_pose import rough_pose
 from tk.model.body.limb_candidates import Limb, exchanged, limbs_of, pairs
-from tk.model.body.skeleton import SEGMENTS, build_skeleton, convert_poses
+from tk.model.body.skeleton import build_skeleton, convert_poses
+from tk.model.body.stored_body import body_values, restore_body
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import spread_out
 from tk.model.cameras.tracker_frame import TrackerFrame
@@ -530,19 +529,9 @@ class ContourTracker:
         skeleton, world = self.body.skeleton, self.world
         return {"pose": world.poses_out(pose), "joints": world.points_out(skeleton.joints(pose))}
 
-    # --- what a result file keeps -------------------------------------------------------------------------------
-
     def model(self) -> Mapping[str, Any]:
         """Return the body as stored in `/model`."""
-        body = self.body
-        return {
-            **{f"dimensions/{name}": value for name, value in asdict(body.dimensions).items()},
-            "parts/name": json.dumps([part.name for part in body.parts]),
-            "parts/segment": json.dumps([part.segment for part in body.parts]),
-            "parts/kind": np.array([part.kind for part in body.parts]),
-            "parts/shape": np.array([part.shape for part in body.parts]),
-            "parts/T_body_part": np.array([part.T_body_part for part in body.parts]),
-        }
+        return body_values(self.body)
 
 
 def _only(frame: Observation, views: NDArray[np.intp]) -> Observation:
@@ -551,42 +540,3 @@ def _only(frame: Observation, views: NDArray[np.intp]) -> Observation:
     sources = None if frame.sources is None else frame.sources[views]
     images = np.empty((len(views), 0, 0, 3), np.uint8)
     return replace(frame, images=images, masks=frame.masks[views], uncertain=uncertain, sources=sources)
-
-
-def restore_dimensions(model: Mapping[str, Any]) -> BodyDimensions:
-    """Return the dimensions that :meth:`ContourTracker.model` stored.
-
-    Raises:
-        ConfigError, TypeError, ValueError: they are incomplete, or impossible.
-    """
-    prefix = "dimensions/"
-    return BodyDimensions(**{k[len(prefix) :]: float(v) for k, v in model.items() if k.startswith(prefix)})
-
-
-def restore_body(model: Mapping[str, Any], up: str = "z") -> ConeBody:
-    """Return the body that :meth:`ContourTracker.model` stored.
-
-    Raises:
-        ConfigError, LookupError, TypeError, ValueError: the model is incomplete, or describes no body.
-    """
-    body = build_cone_body(restore_dimensions(model), up)
-    # the stored parts, because another version of the program may divide the body differently
-    names, segments = (json.loads(str(model[f"parts/{name}"])) for name in ("name", "segment"))
-    kinds = np.asarray(model["parts/kind"])
-    shapes, places = (np.asarray(model[f"parts/{name}"], np.float64) for name in ("shape", "T_body_part"))
-    count = len(names)
-    if not set(segments) <= set(SEGMENTS) or not set(kinds.ravel().tolist()) <= {CONE, ELLIPSOID}:
-        raise ValueError("a part has an unknown segment or kind")
-    found = [np.shape(values) for values in (names, segments, kinds, shapes, places)]
-    if found != [(count,), (count,), (count,), (count, 4), (count, 4, 4)] or not (
-        np.isfinite(shapes).all() and np.isfinite(places).all()
-    ):
-        raise ValueError("the parts have the wrong number, shape or values")
-    ends = {part.name: part.ends for part in body.parts}
-    return replace(
-        body,
-        parts=tuple(
-            ConePart(str(name), segment, int(kind), tuple(shape), T, ends.get(str(name), (False, False)))
-            for name, segment, kind, shape, T in zip(names, segments, kinds, shapes.tolist(), places, strict=True)
-        ),
-    )

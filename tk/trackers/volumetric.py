@@ -26,6 +26,7 @@ from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import ConeBody
 from tk.model.body.joints import CHAIN_OF_SEGMENT, CHAINS, JOINTS
 from tk.model.body.skeleton import build_skeleton, convert_poses
+from tk.model.body.stored_body import restore_body
 from tk.model.body.superellipsoid_body import SuperellipsoidBody, build_superellipsoid_body
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume, VoxelGrid
@@ -37,7 +38,7 @@ from tk.model.setup import InitPose, Setup
 from tk.optim import schedule
 from tk.optim.smd import MAX_ITERATIONS
 from tk.settings import Settings
-from tk.trackers.contour_tracker import ContourTracker, restore_body
+from tk.trackers.contour_tracker import ContourTracker
 from tk.trackers.protocol import Estimate, Observation, Stopwatch
 
 Float = NDArray[np.float64]
