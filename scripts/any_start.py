@@ -21,6 +21,7 @@ import numpy as np
 from scripts.faults import OFF_M
 from scripts.synthetic.keypoints import write_keypoints
 from tk.io.captures.capture import Capture, open_capture
+from tk.io.captures.capture_toml import GivenSubject
 from tk.io.results.reader import read_joints, read_result
 from tk.io.results.status import Status
 from tk.run.reporter import Silent
@@ -47,7 +48,7 @@ class Quiet(Silent):
 def starts(capture: Capture, keypoints: Path) -> dict[str, Capture]:
     """Return the capture by name of its start."""
     cut = replace(capture, init_pose="any")
-    unmeasured = replace(cut, subject_height_m=None)
+    unmeasured = replace(cut, subjects=(GivenSubject(),))
     with_keypoints = replace(unmeasured, init_keypoints=keypoints)
     return {"normal": capture, "cut": cut, "cut, no height": unmeasured, "cut, keypoints": with_keypoints}
 

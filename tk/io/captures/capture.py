@@ -74,7 +74,6 @@ class Capture:
         rig: the cameras, in the calibration file's order.
         volume: the working volume, world frame, metres; inferred from the rig if `capture.toml` has none.
         frame_count: number of frames that all cameras (and masks) have.
-        subject_height_m: height of the first subject, metres; None if unknown.
         init_frame: the frame in which the subject stands in the initialisation pose.
         init_pose: "da-vinci", or "any" if the subject may begin in any pose.
         init_keypoints: folder of 2D keypoints of the first pose; None if there is none.
@@ -95,7 +94,6 @@ class Capture:
     rig: Rig
     volume: Volume
     frame_count: int
-    subject_height_m: float | None
     init_frame: int
     init_pose: str
     init_keypoints: Path | None
@@ -125,6 +123,11 @@ class Capture:
         return replace(self, time_offset_s=(0.0,) * len(self.rig), frame_count=min(clip.frame_count for clip in clips))
 
     @property
+    def subject_height_m(self) -> float | None:
+        """Height of the first subject, metres; None if unknown."""
+        return self.subjects[0].height_m
+
+    @property
     def truth_file(self) -> Path:
         """The ground truth; only evaluation captures have the file."""
         return self.path / "truth.h5"
@@ -150,14 +153,12 @@ class Capture:
 
     def setup(self) -> Setup:
         """Return what `calibration.toml` and `capture.toml` say about the scene."""
-        first = Subject(self.subject_height_m, self.init_frame, in_init_pose=self.init_pose != "any")
-        subjects = [replace(first, height_m=given.height_m) for given in self.subjects]
-        subjects[0] = first
-        placed = tuple(
-            replace(s, position=None if given.position is None else np.array(given.position))
-            for s, given in zip(subjects, self.subjects, strict=True)
-        )
-        return Setup(self.rig, self.volume, self.up, self.fps, placed)
+        subjects = []
+        for given in self.subjects:
+            position = None if given.position is None else np.array(given.position)
+            in_init_pose = self.init_pose != "any"
+            subjects.append(Subject(given.height_m, self.init_frame, position=position, in_init_pose=in_init_pose))
+        return Setup(self.rig, self.volume, self.up, self.fps, tuple(subjects))
 
     def shifted(self, time_offset_s: Sequence[float]) -> Capture:
         """Return the capture with other time offsets (C,); it ends with the first video."""
@@ -289,7 +290,6 @@ def open_capture(
         rig=rig,
         volume=_working_volume(settings, rig, path, warnings.append),
         frame_count=frame_count,
-        subject_height_m=settings.subjects[0].height_m,
         subjects=settings.subjects,
         init_frame=settings.init_frame,
         init_pose=settings.init_pose,
