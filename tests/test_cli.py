@@ -66,15 +66,6 @@ def test_track_finds_the_person(tk: Tk, tracked: Path, tiny: Path) -> None:
     assert f"{FRAMES} frames judged: 0 lost" in table.out
 
 
-def test_masks_none_segments_the_videos(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
-    result = tmp_path / "r.h5"
-    ran = tk("track", tiny, "-o", result, "--config", quick, "--frames", ":5", "--masks", "none")
-    assert ran.code == 0, ran.err
-    with h5py.File(result, "r") as file:
-        assert (file["timing/masks"][()] > 0).all()
-        assert (file["status"][()] < 3).all()
-
-
 def test_masks_from_a_folder_and_chosen_cameras_are_used(tk: Tk, quick: Path, copy: Path, tmp_path: Path) -> None:
     shutil.move(copy / "masks", tmp_path / "mine")
     shutil.rmtree(copy / "background")  # masks could not be made from the videos
@@ -194,7 +185,10 @@ SPOILT: dict[str, tuple[Callable[[Path], object], list[str]]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("method", "spoil"), [*(("region", name) for name in SPOILT), ("volumetric", "nobody there")])
+@pytest.mark.parametrize(
+    ("method", "spoil"),
+    [*(("region", name) for name in SPOILT), ("volumetric", "nobody there"), ("silhouette", "nobody there")],
+)
 def test_error_of_a_bad_capture_is_one_line_with_the_file(
     tk: Tk, quick: Path, copy: Path, tmp_path: Path, method: str, spoil: str
 ) -> None:

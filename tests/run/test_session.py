@@ -1,6 +1,6 @@
 """The loop: same seed, same file; runs that are stopped, prolonged or taken up again; where a run starts.
 
-By the volumetric tracker; tests/test_region_track.py has what is the default's own, and kills a run.
+By the volumetric tracker; tests/trackers/test_region_track.py has what is the default's own, and kills a run.
 """
 
 from __future__ import annotations
@@ -101,13 +101,7 @@ def stop_at(frame: int) -> Silent:
     return Stop()
 
 
-# --- the same again ---------------------------------------------------------------------------------------------------
-
-
-def test_the_same_seed_gives_the_same_result(tiny: Path, tracked: Path, tmp_path: Path) -> None:
-    summary = run(tiny, tmp_path / "again.h5", store_hull=True)
-    assert (summary.frames, summary.tracked_now, summary.interrupted) == (FRAMES, FRAMES, False)
-    assert_same(tmp_path / "again.h5", tracked)
+# --- seeds ------------------------------------------------------------------------------------------------------------
 
 
 def test_another_seed_gives_another_result(tiny: Path, tracked: Path, tmp_path: Path) -> None:
@@ -362,9 +356,15 @@ def test_requested_frames_are_tracked(tiny: Path) -> None:
     assert choose_frames(late, (0, 6), notes.append) == (5, 6)
 
 
-def test_mog2_segmentation_tracks_the_person(tiny: Path, tmp_path: Path) -> None:
-    config = settings_file.from_toml(f'segmentation = "mog2"\n{QUICK}')
-    assert track(open_capture(tiny, masks="none"), tmp_path / "r.h5", config, Silent(), frames=(0, 4)).lost == 0
+@pytest.mark.parametrize(
+    ("method", "segmentation"), [("region", "collinearity"), ("silhouette", "collinearity"), ("volumetric", "mog2")]
+)
+def test_masks_are_made_from_the_videos(tiny: Path, tmp_path: Path, method: str, segmentation: str) -> None:
+    config, path = settings_file.from_toml(f'segmentation = "{segmentation}"\n{QUICK}'), tmp_path / "r.h5"
+    capture = open_capture(tiny, masks="none")
+    assert session.track(capture, path, config, Silent(), method, frames=(0, 4)).lost == 0
+    found, truth = read_result(path), read_joints(tiny / "truth.h5").positions[:4]
+    assert np.linalg.norm(found.joints - truth, axis=2).mean() < 0.1 and (found.timing["masks"] > 0).all()
 
 
 def test_unknown_method() -> None:

@@ -1,4 +1,4 @@
-"""``tk track`` as it is by default: the region tracker, its second pass, bodies from files, runs that are taken up."""
+"""``tk track`` by default: the region tracker, its second pass, bodies from files, resumed runs; and by silhouettes."""
 
 from __future__ import annotations
 
@@ -238,6 +238,23 @@ def test_a_causal_result_can_be_extended(tiny: Path, causal: Path, tmp_path: Pat
     assert_same(tmp_path / "r.h5", causal)
 
 
+def test_a_result_of_the_silhouette_tracker_follows_the_contract_and_can_be_extended(
+    tiny: Path, tmp_path: Path
+) -> None:
+    whole, parts = tmp_path / "whole.h5", tmp_path / "parts.h5"
+    summary = run(tiny, whole, method="silhouette", frames=(0, 8))
+    assert (summary.frames, summary.lost) == (8, 0)
+    run(tiny, parts, method="silhouette", frames=(0, 5))
+    assert run(tiny, parts, method="silhouette", frames=(0, 8), resume=True).tracked_now == 3
+    result = read_result(whole)
+    np.testing.assert_array_equal(read_result(parts).pose, result.pose)
+    assert result.meta.method == "silhouette" and mean_error(result, tiny) < 0.08
+    assert result.status.tolist() == [Status.INITIALISED] + [Status.TRACKED] * 7
+    assert (result.pose.shape, result.iterations.shape) == ((8, 31), (8, 3))
+    assert {"decode", "masks", "masks_clean", "optimise", "check", "total"} <= set(result.timing)
+    assert np.shape(result.model["parts/shape"]) == (22, 4)
+
+
 def test_a_person_who_returns_after_most_of_a_second_is_found_again(copy: Path, tmp_path: Path) -> None:
     for camera in (copy / "masks").iterdir():
         for index in range(2, 11):
@@ -359,18 +376,11 @@ def test_a_run_with_another_body_is_not_resumed(tiny: Path, refined: Path, tmp_p
 # --- how it ends ------------------------------------------------------------------------------------------------------
 
 
-def test_exit_codes(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
-    result = tmp_path / "r.h5"
-    command = ["track", tiny, "-o", result, "--config", quick, "--causal", "--frames", ":2"]
-    assert tk(*command).code == 0
-    assert tk("track", tmp_path / "nowhere", "-o", tmp_path / "s.h5").code == 2
-    assert tk("track", tiny).code == 2
-
-
-def test_tracking_starts_from_any_pose_in_any_frame(copy: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("method", ["region", "silhouette"])
+def test_tracking_starts_from_any_pose_in_any_frame(copy: Path, tmp_path: Path, method: str) -> None:
     file = copy / "capture.toml"
     file.write_text(file.read_text(encoding="utf-8").replace("da-vinci", "any"), encoding="utf-8")
-    run(copy, tmp_path / "r.h5", frames=(4, 7), causal=True)
+    run(copy, tmp_path / "r.h5", frames=(4, 7), causal=True, method=method)
     found = read_result(tmp_path / "r.h5")
     assert found.frames.tolist() == [4, 5, 6] and found.status[0] == Status.INITIALISED
 
