@@ -181,7 +181,7 @@ SPOILT: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     "a text for a mask": (
         lambda folder: (folder / "masks/cam2/000000.png").write_text("white"), ["masks/cam2/000000.png"],
     ),
-    "nobody there": (_empty_masks, ["capture", "0 of 4 masks of frame 0 show anybody"]),
+    "nobody there": (_empty_masks, ["capture", "nobody could be tracked: the working volume is empty"]),
 }  # fmt: skip
 
 

@@ -86,6 +86,15 @@ def test_people_outside_the_volume_make_no_camera_inconsistent(tk: Tk, tmp_path:
     assert f"person 1 enters the volume at about frame {second['enters']}" in findings
 
 
+def test_checks_begin_when_the_first_person_enters(tk: Tk, tmp_path: Path) -> None:
+    write_walkers(tmp_path, [[(2.4, 0.3), (0.2, 0.3)]])
+    found = json.loads(tk("inspect", tmp_path, "--json").out)
+    (person,) = found["people"]
+    assert 0 == person["frames"][0] < person["enters"] <= found["frames"][0]
+    assert found["findings"][-1].startswith(f"the volume is empty before about frame {person['enters']}: tk track")
+    assert found["with_hull"] == 1.0
+
+
 def test_one_person_is_listed_without_a_finding(tk: Tk, tmp_path: Path) -> None:
     write_walkers(tmp_path, [[(-0.3, 0.0), (0.3, 0.0)]])
     ran = tk("inspect", tmp_path)

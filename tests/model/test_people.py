@@ -97,7 +97,17 @@ def test_nobody_is_found_in_empty_masks_and_specks() -> None:
     masks = np.zeros((5, 240, 240), np.uint8)
     assert FINDER.find(masks) == ()
     masks[:, 118:124, 118:124] = 255
-    assert FINDER.find(masks) == ()
+    assert FINDER.find(masks) == () and FINDER.is_empty(masks, ())
+
+
+def test_volume_is_not_empty_if_somebody_is_inside_or_the_masks_contradict_each_other() -> None:
+    inside, outside = (drawn([place])[0] for place in ((0.4, 0.6), (0.0, 2.0)))
+    for masks, empty in ((inside, False), (outside, True), (inside | outside, False)):
+        assert FINDER.is_empty(masks, FINDER.find(masks)) == empty
+    apart = np.stack([np.roll(mask, shift, axis=1) for mask, shift in zip(inside, (0, 40, 80, -40, -80), strict=True)])
+    assert not FINDER.find(apart) and not FINDER.is_empty(apart, ())
+    apart[[1, 3]] = False  # two cameras see nobody
+    assert FINDER.is_empty(apart, FINDER.find(apart))
 
 
 def test_operator_at_the_edge_of_some_images_is_found_outside_the_volume() -> None:

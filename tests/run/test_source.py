@@ -25,6 +25,7 @@ from tk.model.cameras.volume import Volume
 from tk.model.masks.silhouettes import draw_silhouettes
 from tk.model.setup import Setup, Subject
 from tk.run import offline
+from tk.run.choice import Choice
 from tk.run.people import Member, People
 from tk.run.plan import Plan
 from tk.run.session import estimates, track_source
@@ -95,6 +96,74 @@ def test_the_second_pass_needs_no_folder(tmp_path: Path) -> None:
     result = read_result(tmp_path / "r.h5")
     expected = np.array([BODY.skeleton.joints(pose) for pose in POSES])
     assert np.linalg.norm(result.joints - expected, axis=2).mean() < 0.03
+
+
+# --- nobody is there yet ----------------------------------------------------------------------------------------------
+
+EMPTY = 3
+LATE = Rendered(np.concatenate([0 * ONE.masks[:EMPTY], ONE.masks]))
+
+
+@pytest.mark.parametrize("people", ["auto", "all", (0,)])
+def test_frames_before_the_first_person_are_absent_and_the_others_as_if_tracking_began_there(
+    tmp_path: Path, people: Choice
+) -> None:
+    reporter, late, begun = Silent(), tmp_path / "late.h5", tmp_path / "begun.h5"
+    any_pose = replace(SETUP, subjects=(replace(SETUP.subjects[0], in_init_pose=False),))
+    summary = track_source(SETUP, LATE, late, SETTINGS, reporter, people=people)
+    track_source(any_pose, LATE, begun, SETTINGS, Silent(), frames=(EMPTY, None), people=people)
+    result, expected = read_result(late), read_result(begun)
+    absent = 0 if people == "all" else EMPTY  # of several people, only frames with a person have rows
+    assert (result.status == Status.ABSENT).tolist() == absent * [True] + len(POSES) * [False]
+    assert summary.present == len(POSES) and reporter.frames == list(range(EMPTY + len(POSES)))
+    assert reporter.notes == [f"frame {EMPTY}: the first person has entered"]
+    for name in ("pose", "joints", "sigma", "status"):
+        np.testing.assert_array_equal(getattr(result, name)[absent:], getattr(expected, name), err_msg=name)
+    assert np.isfinite(result.joints).all()
+
+
+def test_a_run_that_was_interrupted_after_the_first_person_came_is_resumed(tmp_path: Path) -> None:
+    class Stopped(Rendered):
+        def frames(self, start: int = 0, stop: int | None = None) -> AbstractContextManager[Iterator[FrameSet]]:
+            def interrupted() -> Iterator[FrameSet]:
+                with super(Stopped, self).frames(start, stop) as frames:
+                    yield from frames
+                raise KeyboardInterrupt
+
+            return nullcontext(interrupted())
+
+    whole, part = tmp_path / "whole.h5", tmp_path / "part.h5"
+    track_source(SETUP, LATE, whole, SETTINGS, Silent())
+    for source, resume in ((Stopped(LATE.masks[: EMPTY + 2]), False), (LATE, True)):
+        track_source(SETUP, source, part, SETTINGS, Silent(), resume=resume)
+    np.testing.assert_array_equal(read_result(part).pose, read_result(whole).pose)
+
+
+def test_nobody_in_any_frame_is_an_error_that_leaves_no_file(tmp_path: Path) -> None:
+    with refused(CaptureError, "nobody could be tracked: the working volume is empty"):
+        track_source(SETUP, LATE, tmp_path / "r.h5", SETTINGS, Silent(), frames=(0, EMPTY))
+    assert not list(tmp_path.iterdir())
+    with refused(CaptureError, "the working volume is empty"):
+        list(estimates(SETUP, LATE, SETTINGS, frames=(0, EMPTY)))
+
+
+def test_a_start_that_fails_after_somebody_has_entered_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+    begin, attempts, refused_in = People._begin, [], [EMPTY]
+
+    def refuse(people: People, member: Member, frames: Sequence[Observation], *rest: Any) -> None:
+        attempts.append(frames[0].index)
+        if frames[0].index in refused_in:
+            raise CaptureError("half a person")
+        begin(people, member, frames, *rest)
+
+    monkeypatch.setattr(People, "_begin", refuse)
+    slow = replace(SETUP, fps=4.0)  # attempts are half a second apart
+    found = list(estimates(slow, LATE, SETTINGS))
+    assert [e.status for e in found][:6] == EMPTY * ["absent"] + 2 * ["lost"] + ["initialised"]
+    assert attempts == [EMPTY, EMPTY + 2]
+    refused_in += range(len(found))
+    with refused(CaptureError, "nobody could be tracked: half a person"):
+        list(estimates(slow, LATE, SETTINGS))
 
 
 # --- two people -------------------------------------------------------------------------------------------------------

@@ -208,7 +208,10 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
     given = [(small[i], small[k]) for i, k in pairs if capture.has_masks and i in small and k in small]
     unrelated = contradiction(given)
     compare = MaskAgreement(capture.rig, capture.volume)
-    people = watch.people()
+    people, entered = watch.people(), watch.entered or 0
+    if (later := frames >= entered).any():  # before it the masks show nobody, or people outside the volume
+        kept, frames = kept[kept >= entered], frames[later]
+        centers = [i for i in centers if i - _LARGEST_DELAY >= entered] or centers
     agreement = compare.compare([masks[int(i)] for i in frames])
     if len(people) > 1:
         own = {index: watch.of_first(index, m) for index, m in masks.items()}
@@ -245,7 +248,7 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
         Sample(int(i), images[int(i)], masks[int(i)], _silhouettes(hulls[list(frames).index(i)], good), compare.step)
         for i in kept
     ]
-    findings = [*_findings(inspection, capture, agreement), *many_people(inspection.people)]
+    findings = [*_findings(inspection, capture, agreement), *many_people(people, entered)]
     return replace(inspection, findings=tuple([unrelated, *findings] if unrelated else findings)), seen
 
 

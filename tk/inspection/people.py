@@ -66,7 +66,7 @@ class PersonReport:
         )
 
 
-@dataclass
+@dataclass(eq=False)
 class _Path:
     """A person who is followed over the looks."""
 
@@ -83,6 +83,11 @@ class PeopleWatch:
     Args:
         capture: the capture.
         span: number of frames from the start that are looked at.
+
+    Attributes:
+        entered: frame of the first look in which the working volume was not empty; 0 if it is the first of all, None
+            before it. People in this look have the first numbers, in the order of :func:`order_people`, as in
+            `tk track`; others follow as they came.
     """
 
     def __init__(self, capture: Capture, span: int) -> None:
@@ -92,7 +97,9 @@ class PeopleWatch:
         self._every = max(1, round(capture.fps / _LOOKS_HZ), -(-(span - self._start) // _MOST_LOOKS))
         self._paths: list[_Path] = []
         self._open: list[_Path] = []
-        self._looks, self._first = 0, 0  # number of looks, and frame of the first in which somebody was found
+        self._looks = 0
+        self.entered: int | None = None
+        self._first: list[_Path] = []  # the people in that look
 
     def wants(self, index: int) -> bool:
         """Return whether to :meth:`look` at a frame."""
@@ -108,8 +115,9 @@ class PeopleWatch:
         self._open = [path for path in self._open if index - path.last[0] <= max(hidden, self._every)]
         near = [person for at, person in (path.last for path in self._open) if at == index - self._every]
         found = self._finder.find(masks, uncertain, near)
-        if not self._paths:
-            capture, self._first = self._capture, index
+        enter = self.entered is None and not self._finder.is_empty(masks, found)
+        if enter:
+            capture, self.entered = self._capture, index if index > self._start else 0
             subject = capture.setup().subjects[0]
             found = order_people(found, capture.volume, subject.height_m, subject.position)
         before = np.array([path.last[1].position for path in self._open]).reshape(-1, 3)
@@ -126,6 +134,9 @@ class PeopleWatch:
                 self._paths.append(taken[k])
                 self._open.append(taken[k])
             taken[k].found.append((index, person))
+        if enter:
+            self._first = [taken[k] for k in range(len(found))]
+            self._paths = self._first + [path for path in self._paths if path not in self._first]
 
     def of_first(self, index: int, masks: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the masks (C, H, W) of a frame with the pixels of everybody but person 0 as those of others."""
@@ -140,12 +151,10 @@ class PeopleWatch:
         return owners.share(whole, 0, False).masks
 
     def people(self) -> tuple[PersonReport, ...]:
-        """Return the people: those of the first look in the order of :func:`order_people`, then as they came.
-
-        Somebody who was seen only for a moment is left out, and keeps the number if it is one of the first look.
-        """
+        """Return the people. Somebody who was seen only for a moment is left out; the numbers of the people in the look
+        :attr:`entered` stay."""
         least = min(1 + round(_SEEN_S * self._capture.fps / self._every), self._looks)
-        kept = [path for path in self._paths if path.found[0][0] == self._first or len(path.found) >= least]
+        kept = [path for path in self._paths if path in self._first or len(path.found) >= least]
         return tuple(self._report(k, path.found) for k, path in enumerate(kept) if len(path.found) >= least)
 
     def _report(self, number: int, found: Sequence[tuple[int, LocatedPerson]]) -> PersonReport:
@@ -163,22 +172,30 @@ class PeopleWatch:
         )
 
 
-def many_people(people: Sequence[PersonReport]) -> list[str]:
-    """Return what several people mean for tracking, one line each."""
+def many_people(people: Sequence[PersonReport], entered: int) -> list[str]:
+    """Return what several people, or a volume that is empty before the frame ``entered``, mean for tracking, one line
+    each."""
+    lines = []
+    if entered:
+        lines.append(
+            f"the volume is empty before about frame {entered}: tk track begins there; earlier frames are absent"
+        )
     if len(people) < 2:
-        return []
+        return lines
     inside = [person for person in people if person.enters is not None]
-    lines = [
-        f"{len(people)} people are in view, {len(inside)} of them in the volume: tk track takes person 0, "
-        "--people 1 takes person 1, --people all takes everybody in the volume"
-    ]
+    others = [person.number for person in inside[1:] if person.enters == inside[0].enters]
+    choose = f"--people {others[0]} takes person {others[0]}, " if others else ""
+    lines.append(
+        f"{len(people)} people are in view, {len(inside)} of them in the volume: tk track takes person 0, {choose}"
+        "--people all takes everybody in the volume"
+    )
     for person in people:
         if person.enters is None:
             lines.append(
                 f"person {person.number} stays outside the volume, in {', '.join(person.cameras)}: tk track does not "
                 "take these pixels for the subject's"
             )
-        elif person.enters > person.frames[0]:
+        elif person.enters > max(person.frames[0], entered):
             lines.append(
                 f"person {person.number} enters the volume at about frame {person.enters}: --people all takes this "
                 "person from then on"

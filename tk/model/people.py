@@ -180,13 +180,28 @@ class PeopleFinder:
         known = [c for c in range(len(self._rig)) if small[c].any()]
         found = self._candidates(small, allowed, known, near)
         chosen = self._explaining(found, small)
-        left = small & ~self._covered(chosen)
-        missed = [c for c in known if left[c].sum() * self._pixel_m2[c] > _LEFT_M2]
+        missed = np.flatnonzero(self._unexplained(small, chosen)).tolist()
         if 2 <= len(missed) < len(known):
             # only these cameras show somebody: he or she is hidden in the others, or their masks have a gap
             chosen = self._explaining([*found, *self._candidates(small, allowed, missed, near)], small)
         chosen = [*self._on_one_floor(chosen), *self._alone(small, self._covered(chosen))]
         return tuple(sorted(chosen, key=lambda person: (not person.inside, -np.nan_to_num(person.volume_m3))))
+
+    def is_empty(self, masks: NDArray, people: Sequence[LocatedPerson]) -> bool:
+        """Return whether nobody stands in the working volume, by the people whom :meth:`find` has just found in masks.
+
+        Cameras that contradict each other have no hull, although somebody is there. So two cameras must show nothing
+        that people outside the volume do not explain; with three cameras or less, all but one.
+        """
+        if any(person.inside for person in people):
+            return False
+        unexplained = np.count_nonzero(self._unexplained(self._reduced(masks), people))
+        return bool(unexplained <= max(1, len(masks) - 2))
+
+    def _unexplained(self, masks: Bool, people: Sequence[LocatedPerson]) -> Bool:
+        """Return (C,) whether people leave much of a camera's mask, (C, h, w) reduced, unexplained."""
+        left = masks & ~self._covered(people)
+        return np.asarray(left.sum(axis=(1, 2)) * self._pixel_m2 > _LEFT_M2)
 
     def around(self, position: Float, masks: NDArray[np.uint8], count: int = 0) -> tuple[Float, Float]:
         """Return the hull of one person who was at a position (3,) a frame ago, and the new position.

@@ -137,8 +137,9 @@ def _finish(
                 cameras = UsedCameras(again.rig, cameras.time_offset_s + offsets / fps)
                 if np.round(offsets).any() and alone:
                     note("tracking again: the images of the first pass were not synchronised")
-                    found = _track_again(plan, again, cameras, masks, result.frames, poses, within)
-                    rows = np.flatnonzero(np.isin(result.frames, list(found)))
+                    present = result.status != Status.ABSENT
+                    found = _track_again(plan, again, cameras, masks, result.frames[present], poses[present], within)
+                    rows = np.flatnonzero(present & np.isin(result.frames, list(found)))
                     estimates = [found[int(frame)] for frame in result.frames[rows]]
                     poses[rows] = [e.pose for e in estimates]
                     lost[rows] = [e.status == "lost" for e in estimates]

@@ -1,7 +1,8 @@
 """The people of a run: who is in the scene, who is tracked, and which pixels are whose in each frame.
 
-People are found in the first frame by their visual hulls. Everybody in the working volume gets a tracker, also people
-who are not written, because a body separates their pixels from those of others (:mod:`tk.trackers.sharing`). Pixels
+People are found by their visual hulls, in the first frame in which somebody stands in the working volume. Everybody
+there gets a tracker, also people who are not written, because a body separates their pixels from those of others
+(:mod:`tk.trackers.sharing`). Pixels
 that no body explains show somebody unknown. They are no evidence for the people who are tracked. A person who enters is
 found in them.
 
@@ -14,6 +15,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -99,13 +101,15 @@ class People:
     def __init__(
         self, setup: Setup, first: Tracker, make: Callable[[], Tracker], choice: Choice, note: Callable[[str], None]
     ) -> None:
-        self._setup, self._make, self._choice, self._note = setup, make, choice, note
-        self._tracked = [self._member(0, setup.subjects[0], first)]
+        self._setup, self._first, self._make, self._choice, self._note = setup, first, make, choice, note
+        self._tracked: list[Member] = []
         self._contacts = Contacts()
         self._every = max(1, round(LOOK_EVERY_S * setup.fps))
         self._unknown: deque[Observation] = deque(maxlen=_HISTORY)  # people who are unknown, in the last frames
         self._refused = 0  # consecutive people who could not be tracked
         self._admit_from = 0  # the frame from which on another may be
+        #: why nobody is tracked yet; empty before the first frame
+        self.refusal = ""
         self._known_finder: PeopleFinder | None = None
         share = sharing(first)
         self._grid: RayGrid | None = None if share is None else share.choice
@@ -133,46 +137,101 @@ class People:
     def several(self) -> bool:
         """Whether the result may have several people: each then has rows only for frames in which the person is
         present."""
-        return self._choice == "all" or len(self.members) > 1
+        return self._choice == "all" or (self._choice != "auto" and len(self._choice) > 1)
 
     # --- the first frames ---------------------------------------------------------------------------------------------
 
-    def start(self, opening: Sequence[Observation], given_masks: bool = False) -> None:
+    def start(self, opening: Sequence[Observation], given_masks: bool = False) -> bool:
         """Find the people in the first frame, and start a tracker for everybody in the volume and everybody chosen.
 
         Masks that were made from the images belong to them; ``given_masks`` are compared with them.
 
+        Returns:
+            False if nobody stands in the volume yet, or if somebody who has just entered cannot be tracked yet; then
+            call this method again with the frames from the next one on.
+
         Raises:
-            CaptureError: a chosen person is not there, too few cameras see the person, or the masks do not
-                belong to the images.
+            CaptureError: a chosen person is not there; or, in the first call, too few cameras see the person, or the
+                masks do not belong to the images.
         """
-        compared = spread_over(opening) if given_masks else ()
-        if reason := contradiction(pairwise(sampled(f.images, f.masks) for f in compared)):
-            raise CaptureError(reason)
-        subjects = self._setup.subjects
-        found = self._finder.find(opening[0].masks, opening[0].uncertain)
+        frame, subjects = opening[0], self._setup.subjects
+        found = self._finder.find(frame.masks, frame.uncertain)
+        if not any(s.init for s in subjects) and self._finder.is_empty(frame.masks, found):
+            if not self.refusal:
+                _LOG.info("waiting: nobody stands in the working volume in frame %d", frame.index)
+            if found or not self.refusal:
+                at = "".join(
+                    " (outside it, somebody stands at ({:.1f}, {:.1f}, {:.1f}) m)".format(*person.position)
+                    for person in found[:1]
+                )
+                self.refusal = (
+                    f"the working volume is empty in all frames{at}; check the masks, and [volume] in capture.toml"
+                )
+            self._refused = 0
+            return False
+        if frame.index < self._admit_from:
+            return False
+        entered = bool(self.refusal)
+        if entered:
+            self._begin_in_any_pose()
+        _LOG.info("finding the person in frame %d and fitting the body to %d frames", frame.index, len(opening))
         found = order_people(found, self._setup.volume, subjects[0].height_m, subjects[0].position)
         if self._grid is None and len(found) > 1:
-            raise ConfigError(f"the method {self._tracked[0].tracker.method} tracks one person who is alone in view")
-        numbers: tuple[int, ...] = (0,)
-        if len(found) <= 1 and self._choice in ("auto", "all", (0,)):
+            raise ConfigError(f"the method {self._first.method} tracks one person who is alone in view")
+        alone = len(found) <= 1 and self._choice in ("auto", "all", (0,))
+        numbers = (0,) if alone else chosen(self._choice, found, subjects[0], self._note)
+        try:
+            compared = spread_over(opening) if given_masks else ()
+            if reason := contradiction(pairwise(sampled(f.images, f.masks) for f in compared)):
+                raise CaptureError(reason)
+            self._start(opening, found, numbers, alone)
+        except CaptureError as error:
+            if not entered:
+                raise
+            self._refuse(frame.index, error)
+            self._tracked = []
+            return False
+        if entered:
+            self._note(f"frame {frame.index}: the first person has entered")
+        return True
+
+    def _begin_in_any_pose(self) -> None:
+        """Take the pose in which the subjects begin for unknown, because it is not that of the first frame."""
+        subjects = tuple(replace(s, in_init_pose=False) for s in self._setup.subjects)
+        self._setup = replace(self._setup, subjects=subjects)
+
+    def _start(
+        self, opening: Sequence[Observation], found: Sequence[LocatedPerson], numbers: Sequence[int], alone: bool
+    ) -> None:
+        """Start the trackers of the people found in the first frame. ``numbers``: of those chosen; ``alone``: the hulls
+        show one person at most."""
+        subjects = self._setup.subjects
+        if alone:
+            self._tracked = [self._member(0, subjects[0], self._first)]
             try:
                 self._begin(self._tracked[0], opening, found[0].height_m if found else None)
                 return
             except CaptureError:
                 if self._grid is None or not found or not self._several_in(opening):
                     raise
-        else:
-            numbers = chosen(self._choice, found, subjects[0], self._note)
         people = [found[n] for n in numbers]
         known = matched(subjects[:1] if self._choice == "auto" else subjects, people, self._setup.up)
-        self._tracked = [self._member(0, known[0], self._tracked[0].tracker)]  # its kernels are compiled
+        self._tracked = [self._member(0, known[0], self._first)]  # its kernels are compiled
         self._tracked += [self._member(k, subject, self._make()) for k, subject in enumerate(known[1:], 1)]
         rest = [person for n, person in enumerate(found) if n not in numbers and person.views.sum() >= 2]
         shares = self._shares([*people, *rest], opening)
         refusal = opening_agreement(self._setup, opening).refusal
-        for member, frames, person in zip(self._tracked, shares, people, strict=False):
-            self._begin(member, frames, person.height_m, refusal)
+        for number, member, frames, person in zip(numbers, self._tracked, shares, people, strict=False):
+            try:
+                self._begin(member, frames, person.height_m, refusal)
+            except CaptureError as error:
+                if person.inside:
+                    raise
+                raise CaptureError(
+                    f"person {number} is outside the working volume in frame {opening[0].index} and cannot be tracked "
+                    "from there: choose all, or a later first frame",
+                    hint="with --frames N:",
+                ) from error
         for person, frames in zip(rest, shares[len(people) :], strict=True):
             if person.inside:
                 self._admit(frames, person, unknown(subjects[0]), written=False)
@@ -228,7 +287,13 @@ class People:
     # --- one frame ----------------------------------------------------------------------------------------------------
 
     def step(self, frame: Observation) -> dict[int, Tracked]:
-        """Return the answers of the people in the result who are tracked, by number."""
+        """Return the answers of the people in the result who are tracked, by number.
+
+        Before the first person is tracked, a result of one person has the status absent, or lost if somebody is there.
+        """
+        if not self._tracked:
+            nobody = replace(self._nobody, status="lost" if self._refused else "absent")
+            return {} if self.several else {0: Tracked(nobody, frame, frame)}
         owners: PixelOwners | None = None
         if len(self._tracked) == 1 and not self._shows_others(frame):
             (member,) = self._tracked
@@ -365,14 +430,33 @@ class People:
         try:
             self._begin(member, frames, person.height_m)
         except CaptureError as reason:
-            _LOG.info("nobody can be tracked there: %s", reason)
-            self._refused += 1
-            pause = min(2 ** (self._refused - 1), _LONGEST_PAUSE)
-            self._admit_from = frames[0].index + self._every * pause
+            self._refuse(frames[0].index, reason)
             return None
         self._refused = 0
         self._tracked.append(member)
         return member
+
+    def _refuse(self, frame: int, reason: CaptureError) -> None:
+        """Put off the next attempt to track somebody, because the one in this frame has failed."""
+        _LOG.info("nobody can be tracked there: %s", reason)
+        self.refusal = str(reason)
+        self._refused += 1
+        self._admit_from = frame + self._every * min(2 ** (self._refused - 1), _LONGEST_PAUSE)
+
+    @cached_property
+    def _nobody(self) -> Estimate:
+        """The estimate for a frame before anybody is tracked."""
+        tracker, views = self._first, len(self._setup.rig)
+        return Estimate(
+            pose=np.full(len(tracker.pose_names), np.nan),
+            joints=np.full((len(JOINTS), 3), np.nan),
+            status="absent",
+            objective=np.nan,
+            iterations=np.zeros(len(tracker.stages), np.int32),
+            timing=dict.fromkeys(tracker.timing_stages, 0.0),
+            sigma=np.full(len(JOINTS), np.nan) if tracker.reports_sigma else None,
+            residual=np.full((views, 2), np.nan) if tracker.reports_sigma else None,
+        )
 
     def _gone(self, member: Member, frame: Observation) -> bool:
         """Return whether a lost person has left the last place: in every view most of the body would be on background.
@@ -413,9 +497,11 @@ class People:
         """
         k = 0
         while own := below(f"{_PEOPLE}{k}/", state) if k else state:
-            subject = int(own[_SUBJECT])
-            known = self._setup.subjects[subject] if subject >= 0 else Subject(in_init_pose=bool(own[_IN_INIT_POSE]))
-            tracker = self._make() if k else self._tracked[0].tracker
+            subject, in_init_pose = int(own[_SUBJECT]), bool(own[_IN_INIT_POSE])
+            if subject >= 0 and self._setup.subjects[subject].in_init_pose and not in_init_pose:
+                self._begin_in_any_pose()
+            known = self._setup.subjects[subject] if subject >= 0 else Subject(in_init_pose=in_init_pose)
+            tracker = self._make() if k else self._first
             member = self._member(k, known, tracker, written=k < len(models))
             self._tracked[k:] = [member]
             tracker.restore(models[k] if member.written else below(_MODEL, own), own)

@@ -8,7 +8,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
@@ -192,6 +192,9 @@ def track_source(
         except KeyboardInterrupt:
             # caught outside the writer, which then keeps an older result if no frame is finished
             interrupted = True
+        finally:
+            if not done + run.tracked:
+                stores.remove()
         tracks = read_people(output) if done + run.tracked else ()
         status = [track.status for track in tracks if track.status is not None] or [np.zeros(0, np.uint8)]
         return Summary(np.concatenate(status), time.perf_counter() - started, run.tracked, interrupted, len(status))
@@ -288,12 +291,17 @@ class _Run:
     ) -> None:
         self.plan, self.output, self.masks, self._note = plan, output, masks, note
         self.tracked = 0
+        self._held: list[dict[int, dict[str, ArrayLike]]] = []  # rows of frames that are not in the file yet
         self.finished: Container[int] = ()
         self.people = People(plan.setup, plan.tracker, plan.another_tracker, people, note)
 
     def frames(self) -> Iterator[tuple[Estimate, ...]]:
         """Start or restore the trackers, step them to the end and yield the estimates of each frame's people; they are
-        in the file already."""
+        in the file already, except those before the first person, which are written with that person's first frame.
+
+        Raises:
+            TkError: bad input, or nobody is found.
+        """
         plan, output = self.plan, self.output
         done = output.done if output else 0
         if plan.stop is not None and plan.begin + done >= plan.stop:
@@ -306,19 +314,37 @@ class _Run:
             return
         # The body is fitted to the same frames however few are asked for, so that --resume may extend a run.
         count = self._opening_frames()
-        stop = None if plan.stop is None else max(plan.stop, plan.first + count)
-        observations = plan.observations.frames(plan.first, stop)
+        observations = plan.observations.frames(plan.first, None if plan.stop is None else plan.stop + count)
         _LOG.info("reading the first frames and learning what the scene looks like")
         plan.tracker.prepare()
-        opening, broken = _take(observations, count)
-        _LOG.info("finding the person in frame %d and fitting the body to %d frames", plan.first, len(opening))
-        try:
-            with one_thread():
-                self.people.start([o for o, _ in opening], plan.source.has_masks)
-        except CaptureError as error:
-            reasons = "; ".join([str(error), *plan.source.damaged(plan.first + len(opening))])
-            raise CaptureError(f"{plan.source.where}: {reasons}", error.hint) from None
-        yield from self._step_through(chain(_emptied(opening), broken or observations))
+        yield from self._step_through(self._started(observations, count))
+        if not self.people.members:
+            raise CaptureError(f"{plan.source.where}: nobody could be tracked: {self.people.refusal}")
+
+    def _started(self, observations: Iterator[Observed], count: int) -> Iterator[Observed]:
+        """Yield the observations; start the trackers before the first frame with somebody in the volume is yielded.
+
+        Args:
+            observations: from the first frame on.
+            count: number of frames that the body is fitted to.
+        """
+        opening: list[Observed] = []
+        observations = _fill(opening, observations, count)
+        source, stop = self.plan.source, self.plan.stop
+        while opening and (stop is None or opening[0][0].index < stop):
+            try:
+                with one_thread():
+                    if self.people.start([o for o, _ in opening], source.has_masks):
+                        break
+            except CaptureError as error:
+                reasons = "; ".join([str(error), *source.damaged(opening[-1][0].index + 1)])
+                raise CaptureError(f"{source.where}: {reasons}", error.hint) from None
+            yield opening.pop(0)
+            observations = _fill(opening, observations, count)
+        opening.reverse()
+        while opening:
+            yield opening.pop()  # images are large
+        yield from observations
 
     def _opening_frames(self) -> int:
         """Return the number of frames that the body is fitted to: fewer where the images are large."""
@@ -371,10 +397,9 @@ class _Run:
                 estimates = tuple(replace(e, timing={**laps, **e.timing, "total": total}) for e in estimates)
                 due = not output or stepped - written > WRITE_EVERY_S
                 if output:
-                    self._write_models(output)
-                    rows = {e.person: _row(e, output.store_hull) for e in estimates}
-                    output.writer.append(rows, self._state(output), flush=due)
-                self.tracked += 1
+                    self._held.append({e.person: _row(e, output.store_hull) for e in estimates})
+                    if self.people.members:
+                        self._write(output, due)
                 finished.append(estimates)
                 writing = time.perf_counter() - stepped
                 if due:
@@ -386,12 +411,19 @@ class _Run:
             raise
         yield from self._written(finished)
 
-    def _write_models(self, output: _Output) -> None:
-        """Write the bodies of people whose trackers have just started."""
+    def _write(self, output: _Output, flush: bool) -> None:
+        """Write the frames that are not in the file yet, and the bodies of people whose trackers have just started."""
         models = output.writer.models
         for member in self.people.members:
             if member.number >= len(models) or not models[member.number]:
                 output.writer.write_model(member.tracker.model(), person=member.number)
+        *earlier, last = self._held
+        for absent in earlier:  # with the nearest pose, as later absent frames
+            rows = {n: row | {k: last[n][k] for k in ("pose", "joints/position")} for n, row in absent.items()}
+            output.writer.append(rows, flush=False)
+        output.writer.append(last, self._state(output), flush=flush)
+        self.tracked += len(self._held)
+        self._held.clear()
 
     def _step(self, observation: Observation) -> tuple[Estimate, ...] | None:
         """Step all trackers; return the estimates of the people who are present, None before the first frame to be
@@ -424,7 +456,7 @@ class _Run:
         return taken
 
     def _written(self, finished: list[tuple[Estimate, ...]]) -> Iterator[tuple[Estimate, ...]]:
-        if self.output and finished:
+        if self.output and self.tracked:
             self.output.writer.flush()
         yield from finished
 
@@ -433,27 +465,16 @@ class _Run:
         return {**self.people.state(), **origin}
 
 
-def _take(observations: Iterator[Observed], count: int) -> tuple[list[Observed], Iterator[Observed] | None]:
-    """Return the first ``count`` observations; if one after the first cannot be read, those before it, and an iterator
-    that raises the error."""
-    taken: list[Observed] = []
+def _fill(taken: list[Observed], observations: Iterator[Observed], count: int) -> Iterator[Observed]:
+    """Take observations until there are ``count``, and return the others. If one after the first cannot be read, the
+    others raise the error."""
     try:
-        for observation in observations:
-            taken.append(observation)
-            if len(taken) == count:
-                break
+        taken.extend(islice(observations, count - len(taken)))
     except TkError as error:
         if not taken:
             raise
-        return taken, _raising(error)
-    return taken, None
-
-
-def _emptied(opening: list[Observed]) -> Iterator[Observed]:
-    """Yield the opening and keep none of it, because images are large."""
-    opening.reverse()
-    while opening:
-        yield opening.pop()
+        return _raising(error)
+    return observations
 
 
 def _raising(error: TkError) -> Iterator[Observed]:

@@ -117,7 +117,7 @@ class CameraMonitor:
         if agreement.refusal:
             raise CaptureError(agreement.refusal)
         self._tested = int(agreement.tested_right.sum()) >= 2
-        if isinstance(self.tracker, RegionTracker) and agreement.undetected_m > 0:
+        if isinstance(self.tracker, RegionTracker):
             self.tracker.view_m = float(np.hypot(VIEW_M, agreement.undetected_m))
         for camera in agreement.wrong:
             self._excluded[camera] = True

@@ -53,7 +53,7 @@ class Estimate:
 
     Attributes:
         pose: (D,) pose vector, radians and metres, in the order of the tracker's ``pose_names``.
-        joints: (J, 3) joint centres, metres.
+        joints: (J, 3) joint centres, metres. Pose and joints are NaN before anybody is tracked.
         status: "tracked", "initialised", "recovered", "lost", "suspect" (by the camera monitor), or "absent" (by the
             run: nobody is there).
         objective: the objective's final value; the region tracker gives the running mean of its cost.

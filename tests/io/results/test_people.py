@@ -14,6 +14,7 @@ from tests.io.result_victim import META, make_frame, make_state
 from tk.errors import ResultError
 from tk.io.results.reader import read_joints, read_people, read_result
 from tk.io.results.revision import revise_result
+from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
 from tk.model.body.joints import JOINTS
 
@@ -42,6 +43,19 @@ def assert_linked(path: Path) -> None:
         first = file["people/0"]
         assert set(first) == set(file) - {"people", "resume", "cameras"}
         assert all(first[name] == file[name] for name in first)
+
+
+def test_absent_frames_of_one_person_are_aligned_as_those_of_several(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    with ResultWriter.create(path, META) as writer:
+        for index in range(4):
+            writer.append({0: make_frame(index) | {"status": Status.ABSENT if index < 2 else Status.TRACKED}})
+    result = read_result(path)
+    (aligned,) = result.aligned()
+    assert np.isfinite(result.joints).all() and np.isnan(aligned.joints[:2]).all()
+    np.testing.assert_array_equal(aligned.joints[2:], result.joints[2:])
+    np.testing.assert_array_equal(aligned.status, result.status)
+    np.testing.assert_array_equal(aligned.time, result.time)
 
 
 def test_each_person_has_rows_of_the_frames_in_which_they_are_present(tmp_path: Path) -> None:

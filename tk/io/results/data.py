@@ -274,10 +274,10 @@ class Result:
         return replace(self, meta=replace(self.meta, joint_names=JOINTS), joints=joints, sigma=sigma)
 
     def aligned(self) -> tuple[Result, ...]:
-        """Return the results of all people, of several without smoothed copy and hull, with a row for each frame of
-        anybody. Added rows have the status ABSENT and NaN.
+        """Return the results of all people with a row for each frame of anybody; rows of absent people have the status
+        ABSENT and NaN. If people are absent, the results have no smoothed copy and no hull.
         """
-        if not self.others:
+        if not self.others and not (self.status == Status.ABSENT).any():
             return (self,)
         frames = np.unique(np.concatenate([person.frames for person in self.people]))
         time = np.empty(len(frames))
@@ -286,7 +286,9 @@ class Result:
         found = []
         for person in self.people:
             rows = np.full(len(frames), -1)
-            rows[np.searchsorted(frames, person.frames)] = np.arange(len(person))
+            rows[np.searchsorted(frames, person.frames)] = np.where(
+                person.status == Status.ABSENT, -1, np.arange(len(person))
+            )
             found.append(replace(person.at_rows(rows), frames=frames, time=time))
         return tuple(found)
 

@@ -52,8 +52,7 @@ _SWAPS_OF = 8
 
 _CAUSES = (
     "a camera was turned or moved after the calibration, calibration.toml is of another recording, the videos do not "
-    "belong to these cameras or to the same time, or the masks show something else than the person; if "
-    "nobody is in the working volume yet, choose a later first frame (--frames N:)"
+    "belong to these cameras or to the same time, or the masks show something else than the person"
 )
 
 
