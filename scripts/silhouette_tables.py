@@ -25,6 +25,7 @@ from tk.kernels.line_search import SearchSettings
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.cues.ray_costs import Evidence, RayGrid
+from tk.model.setup import Subject
 from tk.optim.gauss_newton import GaussNewtonSettings
 from tk.settings import SilhouetteSettings
 from tk.trackers.contour_tracker import LINE_SEARCH, SOLVER
@@ -123,7 +124,7 @@ def track(data: Sequence3D, name: str, views: int, config: Variant) -> tuple[Row
     empty = np.zeros(0, np.uint8)
     frames = [Observation(i, empty, np.ascontiguousarray(m[:views])) for i, m in enumerate(data.masks)]
     tracker = SilhouetteTracker(rig, data.up, config.settings, config.line_search, config.solver)
-    tracker.start(frames[: config.settings.init_frames], data.height_m, None)
+    tracker.start(frames[: config.settings.init_frames], Subject(data.height_m))
     estimates = [tracker.step(frame) for frame in frames]
     joints = np.array([e.joints for e in estimates])
     every = max(1, len(frames) // 68)

@@ -37,7 +37,7 @@ class Scene:
             self.frames = [Observation(f.index, f.images.copy(), np.array(f.masks)) for f in frames]
         self.truth = read_joints(folder / "truth.h5").positions
         tracker = self._tracker()
-        tracker.start(self.frames[: tracker.opening_frames], self.capture.subject_height_m, None)
+        tracker.start(self.frames[: tracker.opening_frames], Subject(self.capture.subject_height_m))
         self.model, self.state = tracker.model(), tracker.state()
 
     def _tracker(self) -> RegionTracker:

@@ -13,6 +13,7 @@ from tk.model.body.cone_body import build_cone_body
 from tk.model.body.gait_poses import neutral_pose, standing_pose, walking_pose
 from tk.model.body.skeleton import JOINTS, shoulder_angles
 from tk.model.masks.silhouettes import draw_silhouettes
+from tk.model.setup import Subject
 from tk.optim.gauss_newton import BatchSolution
 from tk.settings import SilhouetteSettings
 from tk.trackers.initialisation import TrajectoryHypothesis, find_person, stature_of
@@ -111,7 +112,7 @@ def test_hypothesis_whose_fitted_body_has_the_lower_residual_is_chosen(monkeypat
         for pose, residual in ((wrong, 0.10), (right, 0.105))
     ]
     monkeypatch.setattr("tk.trackers.contour_tracker.find_person", lambda *_: hypotheses)
-    pose = tracker.world.poses_out(tracker.find(frames, STATURE, None))
+    pose = tracker.world.poses_out(tracker.find(frames, Subject(STATURE)))
     assert error(SKELETON.joints(pose)[None], right[None])[0] < 0.02
 
 
@@ -165,7 +166,7 @@ def test_lower_hull_corrects_the_stature_of_wide_clothes(monkeypatch, hull_m: fl
     monkeypatch.setattr(
         "tk.trackers.contour_tracker.find_person", lambda *_: [TrajectoryHypothesis(np.zeros((1, 1)), 0.1)]
     )
-    tracker.find([frame], None, None, hull_m=hull_m)
+    tracker.find([frame], Subject(hull_m=hull_m))
     assert apparent > 1.1 * STATURE
     assert tracker.body.dimensions == BodyDimensions.from_stature(expected or apparent)
 
@@ -175,7 +176,7 @@ def test_height_that_contradicts_the_silhouettes_is_refused(height: float) -> No
     tracker = tracker_of()
     masks = draw_silhouettes(tracker.body, RIG, placed(standing_pose(SKELETON), 0.4)[None])[0]
     with pytest.raises(CaptureError, match=f"height of {height:.2f} m contradicts the silhouettes.*about 1.7"):
-        tracker.find([Observation(0, np.zeros(0, np.uint8), masks)], height, None)
+        tracker.find([Observation(0, np.zeros(0, np.uint8), masks)], Subject(height))
 
 
 def test_empty_first_frame_is_refused() -> None:

@@ -10,6 +10,7 @@ from tk.kernels.mask_values import OTHERS
 from tk.kernels.silhouette import find_edgels
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Views, draw_silhouettes
+from tk.model.setup import Subject
 from tk.settings import SilhouetteSettings
 from tk.trackers.contour_tracker import LINE_SEARCH
 from tk.trackers.region import RegionTracker
@@ -54,7 +55,7 @@ def test_no_contour_is_searched_at_another_person() -> None:
 
 def test_person_behind_another_one_is_tracked() -> None:
     tracker = RegionTracker(RIG, "z", SilhouetteSettings(adapt=False))
-    tracker.start([observe(MASKS[0])], STATURE, None, BODY)
+    tracker.start([observe(MASKS[0])], Subject(STATURE, body=BODY))
     tracker.step(observe(MASKS[0]))
     for i in (1, 2):
         estimate = tracker.step(observe(MARKED[i], i))

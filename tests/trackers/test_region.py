@@ -19,7 +19,7 @@ from tk.model.body.skeleton import JOINTS, shoulder_angles
 from tk.model.cameras.camera import Rig
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import draw_silhouettes
-from tk.model.setup import InitPose
+from tk.model.setup import InitPose, Subject
 from tk.settings import RegionSettings, SilhouetteSettings
 from tk.trackers.region import UNKNOWN_AFTER, RegionTracker
 from tk.trackers.residual import LEAST_SPREAD
@@ -60,7 +60,7 @@ def tracker_at(
 ) -> RegionTracker:
     """A tracker of this body that starts near a pose."""
     tracker = RegionTracker(RIG, "z", contours, config)
-    tracker.start([observe(masks, 0, images)], None, init_of(pose), body)
+    tracker.start([observe(masks, 0, images)], Subject(init=init_of(pose), body=body))
     return tracker
 
 
@@ -287,11 +287,11 @@ def test_scales_and_iterations_follow_from_how_far_the_prediction_may_err(
 
 def test_person_is_found_without_a_given_pose() -> None:
     tracker = RegionTracker(RIG, "z", SETTINGS)
-    tracker.start([observe(m, i) for i, m in enumerate(MASKS[:3])], STATURE, None)
+    tracker.start([observe(m, i) for i, m in enumerate(MASKS[:3])], Subject(STATURE))
     estimate = tracker.step(observe(MASKS[0]))
     assert estimate.status == "initialised" and errors(estimate, POSES[0]).mean() < CLOSE_M
     with pytest.raises(CaptureError, match="0 of 3 masks of frame 7 show anybody"):
-        tracker.start([observe(np.zeros_like(MASKS[0]), 7)], STATURE, None)
+        tracker.start([observe(np.zeros_like(MASKS[0]), 7)], Subject(STATURE))
 
 
 # --- colours ----------------------------------------------------------------------------------------------------------
@@ -334,7 +334,7 @@ def test_colors_locate_a_forearm_inside_the_silhouette() -> None:
         images, masks = clothed(poses), draw_silhouettes(BODY, FRONT, poses)
         for colored in (True, False):
             tracker = RegionTracker(FRONT, "z", SETTINGS, RegionSettings(colors=colored))
-            tracker.start([observe(masks[0], 0, images[0])], None, init_of(poses[0]), BODY)
+            tracker.start([observe(masks[0], 0, images[0])], Subject(init=init_of(poses[0]), body=BODY))
             found = [tracker.step(observe(m, i, p)) for i, (m, p) in enumerate(zip(masks, images, strict=True))]
             off[colored] += [errors(e, p)[wrist] for e, p in zip(found[-3:], poses[-3:], strict=True)]
             assert tracker.colors.known == colored and ("colors" in tracker.state()) == colored
@@ -353,7 +353,7 @@ def test_second_pass_corrects_a_wrong_body() -> None:
     """A first pass with a body that is too thin; the second fits it to all frames."""
     thin = build_cone_body(scaled(BODY.dimensions, thigh_radius=0.75, chest_half_width=0.85, upper_arm_radius=0.75))
     tracker = RegionTracker(RIG, "z", replace(SETTINGS, adapt=True))
-    tracker.start([observe(MASKS[0])], STATURE, init_of(POSES[0]), thin)
+    tracker.start([observe(MASKS[0])], Subject(STATURE, init=init_of(POSES[0]), body=thin))
     first = [tracker.step(observe(m, i)) for i, m in enumerate(MASKS)]
     poses = np.array([e.pose for e in first])
     error = np.array([e.residual for e in first])

@@ -10,7 +10,7 @@ from tk.errors import CaptureError
 from tk.model.body.cone_body import build_cone_body
 from tk.model.body.skeleton import JOINTS
 from tk.model.masks.silhouettes import draw_silhouettes
-from tk.model.setup import InitPose
+from tk.model.setup import InitPose, Subject
 from tk.settings import SilhouetteSettings
 from tk.trackers.silhouette import SilhouetteTracker
 
@@ -31,7 +31,7 @@ def tracker_at(pose, **settings) -> SilhouetteTracker:
     """A tracker of the true body that starts near a pose."""
     tracker = SilhouetteTracker(RIG, "z", SilhouetteSettings(adapt=False, **settings))
     init = init_of(pose)
-    tracker.start([observe(MASKS[0])], None, init)
+    tracker.start([observe(MASKS[0])], Subject(init=init))
     return tracker
 
 
@@ -67,7 +67,7 @@ def test_a_walk_is_tracked_and_resumed_bit_for_bit():
 def test_the_subject_is_found_without_an_initial_pose():
     config = SilhouetteSettings(adapt=False)
     tracker = SilhouetteTracker(RIG, "z", config)
-    tracker.start([observe(m, i) for i, m in enumerate(MASKS)], STATURE, None)
+    tracker.start([observe(m, i) for i, m in enumerate(MASKS)], Subject(STATURE))
     estimate = tracker.step(observe(MASKS[0]))
     assert errors(estimate, POSES[0]).mean() < CLOSE_M
     sides = [JOINTS.index(name) for name in ("ankle_l", "ankle_r")]
@@ -78,7 +78,7 @@ def test_the_subject_is_found_without_an_initial_pose():
 
 def test_stature_is_estimated_from_the_silhouettes():
     tracker = SilhouetteTracker(RIG, "z", SilhouetteSettings(adapt=False))
-    tracker.start([observe(MASKS[0])], None, None)
+    tracker.start([observe(MASKS[0])], Subject())
     assert tracker.body.dimensions.stature == pytest.approx(STATURE, rel=0.06)
 
 
@@ -87,7 +87,7 @@ def test_start_adapts_the_body_dimensions():
     masks = draw_silhouettes(build_cone_body(thick), RIG, POSES[:3])
     tracker = SilhouetteTracker(RIG, "z", SilhouetteSettings())
     init = init_of(POSES[0])
-    tracker.start([observe(m, i) for i, m in enumerate(masks)], None, init)
+    tracker.start([observe(m, i) for i, m in enumerate(masks)], Subject(init=init))
     found = tracker.body.dimensions
     # what is known of bodies holds radii back a little: three frames, edgels that are taken to err by 3 px
     for name in ("thigh_radius", "head_radius"):
@@ -115,6 +115,6 @@ def test_an_empty_first_frame_is_reported():
     masks = MASKS[0].copy()
     masks[1:] = 0
     with pytest.raises(CaptureError, match="1 of 3 masks of frame 7 show anybody"):
-        tracker.start([observe(masks, 7)], None, None)
+        tracker.start([observe(masks, 7)], Subject())
     with pytest.raises(RuntimeError, match="no body yet"):
         tracker.step(observe(MASKS[0]))

@@ -8,6 +8,7 @@ from tests.trackers.walker import BODY, STATURE, errors, observe, walk
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.volume import Volume
 from tk.model.masks.silhouettes import draw_silhouettes
+from tk.model.setup import Subject
 from tk.settings import Settings, VolumetricSettings
 from tk.trackers.volumetric import VolumetricTracker
 
@@ -21,7 +22,7 @@ def test_limb_search_recovers_a_displaced_arm(angles: tuple[float, ...]) -> None
     images = np.full((*masks.shape, 3), 90, np.uint8)
     config = Settings(voxels=48, volumetric=VolumetricSettings(edge_weight=0.0))  # one colour has no edges
     tracker = VolumetricTracker(rig, Volume((0, 0, 1), (2, 2, 2.2)), "z", config)
-    tracker.start([observe(masks, 0, images)], STATURE, None, BODY)
+    tracker.start([observe(masks, 0, images)], Subject(STATURE, body=BODY))
     model, state = dict(tracker.model()), dict(tracker.state())
     wrong = state["pose"].copy()
     names = ("shoulder_l_yaw", "shoulder_l_pitch", "shoulder_l_roll", "elbow_l_flexion")

@@ -50,6 +50,7 @@ class Subject:
     in_init_pose: bool = True
     # (3,) m, rough position in that frame, to choose among several people; None if unknown
     position: NDArray[np.float64] | None = None
+    hull_m: float | None = None  # height of the visual hull in the first frame; an unknown height is at most that
 
 
 @dataclass(frozen=True)

@@ -246,7 +246,7 @@ class People:
         seen = member.monitor.start(frames)
         if refusal and not member.monitor.tested:
             raise CaptureError(refusal)
-        member.tracker.start(seen, subject.height_m, subject.init, subject.body, hull_m)
+        member.tracker.start(seen, replace(subject, hull_m=hull_m))
         member.monitor.check_body()
 
     @property

@@ -31,7 +31,7 @@ from tk.model.cameras.tracker_frame import TrackerFrame
 from tk.model.cues.part_colors import PartColors, RenderedBody, color_bins
 from tk.model.cues.ray_costs import Evidence, RayGrid, mean_of_views
 from tk.model.masks.silhouettes import Pyramid, Views
-from tk.model.setup import InitPose
+from tk.model.setup import Subject
 from tk.optim import gauss_newton
 from tk.optim.gauss_newton import BatchSolution, GaussNewtonSettings, Prior
 from tk.settings import SilhouetteSettings
@@ -167,23 +167,13 @@ class ContourTracker:
 
     # --- initialisation (silhouette paper, section 4.6) ---------------------------------------------------------
 
-    def find(
-        self,
-        frames: Sequence[Observation],
-        height_m: float | None,
-        init: InitPose | None,
-        body: ConeBody | None = None,
-        hull_m: float | None = None,
-    ) -> Float:
+    def find(self, frames: Sequence[Observation], subject: Subject) -> Float:
         """Return the pose (D,) in the first of the frames; the body is fitted to all of them.
 
         Args:
             frames: consecutive observations, at least one; a whole stride is better.
-            height_m: the subject's height, if known.
-            init: a rough pose given by the user, in the capture's world; None tries walking phases, standing and the Da
-                Vinci pose.
-            body: the body, if known; it is not fitted then.
-            hull_m: the height of the visual hull, if known, an estimate of the stature.
+            subject: what is known of the person. A body that is known is not fitted. Without a rough pose, walking
+                phases, standing and the Da Vinci pose are tried.
 
         Raises:
             CaptureError: fewer than two cameras see anybody in the first frame, or the silhouettes contradict the
@@ -191,7 +181,8 @@ class ContourTracker:
         """
         pyramids = [self.pyramid(frame) for frame in frames]
         rough: Float | None = None
-        stature = (init and init.height_m) or height_m
+        init, hull_m = subject.init, subject.hull_m
+        stature = (init and init.height_m) or subject.height_m
         if init is None:
             centroid(self.views.rig, pyramids[0], frames[0].index)  # raises if nobody is there, before a body is taken
             apparent = stature_of(self, pyramids[:: 6 if stature else 1])  # a check needs fewer frames
@@ -207,12 +198,12 @@ class ContourTracker:
             average = BodyDimensions.from_stature(stature or apparent)
         else:
             average, given, angles = rough_pose(init.joints, init.angles, stature, self.world)
-        self.take_body(body or build_cone_body(average))
+        self.take_body(subject.body or build_cone_body(average))
         if init is not None:
             rough = self.settle(pyramids[0], convert_poses(angles, given, self.body.skeleton)[None]).states[0]
         with self._opening_cameras(frames, pyramids) as seen:
             hypotheses = find_person(self, *seen, rough)
-        if not self.contours.adapt or body is not None:
+        if not self.contours.adapt or subject.body is not None:
             return np.asarray(hypotheses[0].poses[0])
         return self._adapt(frames, pyramids, hypotheses, average.stature, stature is not None)
 
@@ -290,16 +281,9 @@ class ContourTracker:
         seen = [pyramids[i] for i in chosen]
         return fit_body(self.views, seen, poses[chosen], self.line_search, stature, stature_deviation)
 
-    def start(
-        self,
-        frames: Sequence[Observation],
-        height_m: float | None,
-        init: InitPose | None,
-        body: ConeBody | None = None,
-        hull_m: float | None = None,
-    ) -> None:
+    def start(self, frames: Sequence[Observation], subject: Subject) -> None:
         """Find the subject in the first frame, see :meth:`find`."""
-        self.find(frames, height_m, init, body, hull_m)
+        self.find(frames, subject)
 
     def state(self) -> Mapping[str, Any]:
         """Return what :meth:`restore` needs, beside the model, to continue after the last frame.

@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # the process that decodes and segments needs no parts of a t
     from tk.model.cues.ray_costs import RayGrid
     from tk.model.hull.hull import HullSurface
     from tk.model.masks.silhouettes import Views
-    from tk.model.setup import InitPose, Setup
+    from tk.model.setup import Setup, Subject
     from tk.settings import Settings
 
 Float = NDArray[np.float64]
@@ -137,22 +137,12 @@ class Tracker(Protocol):
         """Compile kernels while there is nothing else to do."""
         ...
 
-    def start(
-        self,
-        frames: Sequence[Observation],
-        height_m: float | None,
-        init: InitPose | None,
-        body: ConeBody | None = None,
-        hull_m: float | None = None,
-    ) -> None:
+    def start(self, frames: Sequence[Observation], subject: Subject) -> None:
         """Find the subject in the first of ``frames`` and fit the body. The first :meth:`step` is for that frame, too.
 
         Args:
             frames: consecutive observations.
-            height_m: the subject's height, if known.
-            init: a rough pose given by a person.
-            body: the body, if known; it is not fitted then.
-            hull_m: the height of the visual hull, if known, an estimate of the stature.
+            subject: what is known of the person.
         """
         ...
 

@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.silhouette import normal_equations
-from tk.model.body.cone_body import ConeBody
 from tk.model.body.joint_sigma import VIEW_M, contour_variance, directions, posture_variance, view_variance
 from tk.model.body.limb_candidates import Limb
 from tk.model.body.skeleton import JOINTS
@@ -37,7 +36,7 @@ from tk.model.cues.visible_contours import contour_shares
 from tk.model.masks.mosaic import doubled
 from tk.model.masks.regions import SQUARE3
 from tk.model.masks.silhouettes import Pyramid
-from tk.model.setup import InitPose, Setup
+from tk.model.setup import Setup, Subject
 from tk.optim.gauss_newton import GaussNewtonSettings, Prior
 from tk.settings import RegionSettings, Settings, SilhouetteSettings
 from tk.trackers.contour_tracker import GAIN, RECOVER_EVERY, SAME_POSE_M, ContourTracker
@@ -133,16 +132,9 @@ class RegionTracker(ContourTracker):
         self.residuals = ResidualBaseline(len(self.rig), self.config.false_alarm)
         self._lost_for = self._high_for = 0
 
-    def start(
-        self,
-        frames: Sequence[Observation],
-        height_m: float | None,
-        init: InitPose | None,
-        body: ConeBody | None = None,
-        hull_m: float | None = None,
-    ) -> None:
+    def start(self, frames: Sequence[Observation], subject: Subject) -> None:
         """Find the subject in the first frame and fit the body to all of them, see :meth:`ContourTracker.find`."""
-        pose = self.find(frames, height_m, init, body, hull_m)
+        pose = self.find(frames, subject)
         self._alive = [Hypothesis(pose, pose, 0.0)]
         self._mean_posture, self._postures = np.zeros((len(JOINTS), 3)), 0
         self._fresh = True

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.line_search import SearchSettings
-from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.camera import Rig
-from tk.model.setup import InitPose, Setup
+from tk.model.setup import Setup, Subject
 from tk.optim.gauss_newton import GaussNewtonSettings
 from tk.settings import Settings, SilhouetteSettings
 from tk.trackers.contour_tracker import LINE_SEARCH, RECOVER_EVERY, SOLVER, ContourTracker
@@ -55,16 +54,9 @@ class SilhouetteTracker(ContourTracker):
         self._lost_for = 0
         self._fresh = True
 
-    def start(
-        self,
-        frames: Sequence[Observation],
-        height_m: float | None,
-        init: InitPose | None,
-        body: ConeBody | None = None,
-        hull_m: float | None = None,
-    ) -> None:
+    def start(self, frames: Sequence[Observation], subject: Subject) -> None:
         """Find the subject in the first frame and fit the body to all of them, see :meth:`ContourTracker.find`."""
-        self._pose = self._previous = self.find([_blind(f) for f in frames], height_m, init, body, hull_m)
+        self._pose = self._previous = self.find([_blind(f) for f in frames], subject)
         self._lost_for = 0
         self._fresh = True
 

@@ -34,7 +34,7 @@ from tk.model.cues.appearance import Appearance
 from tk.model.cues.edge_term import ContourTerm
 from tk.model.cues.objective import NEAR_M, BodyObjective, Fit, FrameObjective
 from tk.model.hull.hull import HullSurface, VisualHull
-from tk.model.setup import InitPose, Setup
+from tk.model.setup import Setup, Subject
 from tk.optim import schedule
 from tk.optim.smd import MAX_ITERATIONS
 from tk.settings import Settings
@@ -115,14 +115,7 @@ class VolumetricTracker:
         """Compile the kernels of the initialisation ahead of its first frame."""
         self._finder.prepare()
 
-    def start(
-        self,
-        frames: Sequence[Observation],
-        height_m: float | None,
-        init: InitPose | None,
-        body: ConeBody | None = None,
-        hull_m: float | None = None,
-    ) -> None:
+    def start(self, frames: Sequence[Observation], subject: Subject) -> None:
         """Find the subject in the first frame and fit the body to all frames, see :meth:`ContourTracker.find`.
 
         Raises:
@@ -130,7 +123,7 @@ class VolumetricTracker:
         """
         # without images: colours inside the silhouettes are a cue of the region tracker only
         blind = [Observation(f.index, f.images[:0], f.masks) for f in frames]
-        pose = self._finder.find(blind, height_m, init, body, hull_m)
+        pose = self._finder.find(blind, subject)
         first = frames[0]
         self.hull.update(first.masks)
         surface = self.hull.surface(first.images)
