@@ -129,8 +129,7 @@ def test_folder_without_permission(tmp_path: Path) -> None:
         ResultWriter.create(tmp_path / "result.h5", META)
 
 
-def test_older_result_stays_until_the_first_new_frame(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_older_result_stays_until_the_first_new_frame(path: Path) -> None:
     write(path, 3)
     before = path.read_bytes()
     with pytest.raises(KeyboardInterrupt), ResultWriter.create(path, META):
@@ -162,8 +161,7 @@ def test_loop_of_links_is_named(tmp_path: Path) -> None:
         read_result(loop)
 
 
-def test_two_runs_cannot_write_the_same_file(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_two_runs_cannot_write_the_same_file(path: Path) -> None:
     with ResultWriter.create(path, META) as writer:
         with pytest.raises(ResultError, match=r"result\.h5: another run"):
             ResultWriter.create(path, META)
@@ -171,12 +169,11 @@ def test_two_runs_cannot_write_the_same_file(tmp_path: Path) -> None:
     assert assert_complete(path, 1) == 1
 
 
-def test_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_hard_links(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(os, "link", refuse)
-    path = tmp_path / "result.h5"
     write(path, 5)
     assert assert_complete(path, 5) == 5
 
@@ -225,8 +222,7 @@ def test_full_disk_gives_one_line_and_keeps_finished_frames(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("writes", [0, 1, 2, 3, 5, 10, 20, 50, 100, 150, 200, 300, 400])
-def test_run_is_resumable_whenever_a_write_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, writes: int) -> None:
-    path = tmp_path / "result.h5"
+def test_run_is_resumable_whenever_a_write_fails(path: Path, monkeypatch: pytest.MonkeyPatch, writes: int) -> None:
     write(path, 3)
     appended = 3
     with monkeypatch.context() as patch:
@@ -242,11 +238,7 @@ def test_run_is_resumable_whenever_a_write_fails(tmp_path: Path, monkeypatch: py
     assert assert_complete(path, appended + 1) == appended + 1
 
 
-def test_interruption_while_hdf5_writes_takes_effect_afterwards(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "result.h5"
-
+def test_interruption_while_hdf5_writes_takes_effect_afterwards(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupt(*arguments: Any) -> None:
         os.kill(os.getpid(), signal.SIGINT)
         original(*arguments)
@@ -259,7 +251,7 @@ def test_interruption_while_hdf5_writes_takes_effect_afterwards(
     assert assert_complete(path, 2) == 2
 
 
-def test_process_ends_normally_with_an_open_writer(tmp_path: Path) -> None:
+def test_process_ends_normally_with_an_open_writer(path: Path) -> None:
     script = """
 import sys
 from tests.io.result_files import append
@@ -268,7 +260,6 @@ from tk.io.results.writer import ResultWriter
 writer = ResultWriter.create(sys.argv[1], META)
 append(writer, 0)
 """
-    path = tmp_path / "result.h5"
     done = subprocess.run([sys.executable, "-c", script, str(path)], cwd=ROOT, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     assert assert_complete(path, 1) == 1

@@ -45,8 +45,7 @@ def assert_linked(path: Path) -> None:
         assert all(first[name] == file[name] for name in first)
 
 
-def test_absent_frames_of_one_person_are_aligned_as_those_of_several(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_absent_frames_of_one_person_are_aligned_as_those_of_several(path: Path) -> None:
     with ResultWriter.create(path, META) as writer:
         for index in range(4):
             writer.append({0: make_frame(index) | {"status": Status.ABSENT if index < 2 else Status.TRACKED}})
@@ -58,8 +57,7 @@ def test_absent_frames_of_one_person_are_aligned_as_those_of_several(tmp_path: P
     np.testing.assert_array_equal(aligned.time, result.time)
 
 
-def test_each_person_has_rows_of_the_frames_in_which_they_are_present(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_each_person_has_rows_of_the_frames_in_which_they_are_present(path: Path) -> None:
     write_two(path, 10)
     result = read_result(path)
     first, second = result.people
@@ -73,8 +71,7 @@ def test_each_person_has_rows_of_the_frames_in_which_they_are_present(tmp_path: 
     assert_linked(path)
 
 
-def test_file_of_one_person_has_no_people_group(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_file_of_one_person_has_no_people_group(path: Path) -> None:
     write(path, 3)
     result = read_result(path)
     assert result.people == (result,)
@@ -102,16 +99,14 @@ def test_run_with_several_people_is_resumed_after_the_last_state(tmp_path: Path)
         np.testing.assert_array_equal(a.hull.offsets, b.hull.offsets)
 
 
-def test_frames_without_anybody_count_as_finished(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_frames_without_anybody_count_as_finished(path: Path) -> None:
     write_two(path, 8)
     writer, done = ResultWriter.resume(path, META)
     writer.close()
     assert done == 8 and len(read_result(path)) == 7
 
 
-def test_person_added_after_the_last_state_has_no_rows_in_the_resumed_run(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_person_added_after_the_last_state_has_no_rows_in_the_resumed_run(path: Path) -> None:
     with ResultWriter.create(path, META) as writer:
         writer.append(people_at(0), make_state(0))
         writer.append(people_at(2))
@@ -122,8 +117,7 @@ def test_person_added_after_the_last_state_has_no_rows_in_the_resumed_run(tmp_pa
     assert [person.frames.tolist() for person in read_result(path).people] == [[3, 6], [6]]
 
 
-def test_person_can_be_added_during_the_run(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_person_can_be_added_during_the_run(path: Path) -> None:
     with ResultWriter.create(path, META) as writer:
         for index in range(4):
             writer.append(people_at(index), make_state(index))
@@ -138,8 +132,7 @@ def test_person_can_be_added_during_the_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("person", [0, 1])
-def test_revision_changes_one_person_and_renews_the_links(tmp_path: Path, person: int) -> None:
-    path = tmp_path / "result.h5"
+def test_revision_changes_one_person_and_renews_the_links(path: Path, person: int) -> None:
     write_two(path, 7)
     before = read_result(path).people
     count = len(before[person])
@@ -181,8 +174,7 @@ def test_joints_of_several_people_are_read_from_results_and_ground_truth(tmp_pat
 
 
 @pytest.mark.parametrize("name", ["2", "left"])
-def test_people_must_be_numbered_without_gaps(tmp_path: Path, name: str) -> None:
-    path = tmp_path / "result.h5"
+def test_people_must_be_numbered_without_gaps(path: Path, name: str) -> None:
     write_two(path, 4)
     with h5py.File(path, "r+") as file:
         file.move("people/1", f"people/{name}")

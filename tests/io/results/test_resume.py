@@ -74,8 +74,7 @@ def test_120_kills_lose_no_finished_frame(tmp_path: Path) -> None:
 # --- resuming ---------------------------------------------------------------------------------------------------------
 
 
-def test_resumed_run_knows_state_and_body_and_equals_an_uninterrupted_one(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_resumed_run_knows_state_and_body_and_equals_an_uninterrupted_one(path: Path) -> None:
     model = {"height_m": 1.7, "torso/radii_m": np.arange(3.0), "names": '["torso"]'}
     with ResultWriter.create(path, META) as writer:
         writer.write_model(model)
@@ -99,8 +98,7 @@ def test_resume_without_a_file_starts_one(tmp_path: Path) -> None:
         assert writer.state == {}
 
 
-def test_frames_after_the_last_state_are_written_again(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_frames_after_the_last_state_are_written_again(path: Path) -> None:
     with ResultWriter.create(path, META) as writer:
         append(writer, *range(6))
         append(writer, *range(6, 9), state=False)
@@ -134,8 +132,7 @@ def test_frames_after_the_last_state_are_written_again(tmp_path: Path) -> None:
         ({"config_toml": META.config_toml + "[hull]\nvoxels = 64\n"}, r"config\.hull\.voxels: not set, not 64"),
     ],
 )
-def test_resuming_another_run_is_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
-    path = tmp_path / "result.h5"
+def test_resuming_another_run_is_refused(path: Path, tmp_path: Path, change: dict[str, Any], message: str) -> None:
     write(path, 2)
     before = path.read_bytes()
     with pytest.raises(ResultError, match=rf"result\.h5: .*{message}.*cannot be resumed"):
@@ -144,8 +141,7 @@ def test_resuming_another_run_is_refused(tmp_path: Path, change: dict[str, Any],
     assert [entry.name for entry in tmp_path.iterdir()] == ["result.h5"]
 
 
-def test_equal_settings_in_different_notation_can_be_resumed(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_equal_settings_in_different_notation_can_be_resumed(path: Path) -> None:
     write(path, 1, replace(META, config_toml='# a comment\nmethod = "volumetric"\nsmd = { mu = 0.10 }\n'))
     assert resume(path, 1) == 1
 
@@ -161,8 +157,7 @@ def test_equal_settings_in_different_notation_can_be_resumed(tmp_path: Path) -> 
         lambda state: pack_state(4, [4, 4], {}),
     ],
 )
-def test_damaged_state_is_refused(tmp_path: Path, change: Callable[[np.ndarray], Any]) -> None:
-    path = tmp_path / "result.h5"
+def test_damaged_state_is_refused(path: Path, change: Callable[[np.ndarray], Any]) -> None:
     write(path, 4)
     with h5py.File(path, "r+") as file:
         state = file["resume"][()]
@@ -174,8 +169,7 @@ def test_damaged_state_is_refused(tmp_path: Path, change: Callable[[np.ndarray],
     assert path.read_bytes() == before
 
 
-def test_state_is_intact_after_the_result_was_copied_and_revised(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_state_is_intact_after_the_result_was_copied_and_revised(path: Path) -> None:
     state = {**make_state(3), "unknown": np.array([np.nan, -np.nan]), "none": "", "umlaut": "ä", "flag": True}
     with ResultWriter.create(path, META) as writer:
         writer.append({0: make_frame(0)}, state)

@@ -27,8 +27,7 @@ from tk.io.results.writer import ResultWriter
 from tk.model.body.skeleton import JOINTS
 
 
-def test_second_pass_replaces_only_the_given_datasets(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_second_pass_replaces_only_the_given_datasets(path: Path, tmp_path: Path) -> None:
     write(path, 6)
     before = read_result(path)
     pose, sigma = np.random.default_rng(0).normal(size=(6, 24)), np.full((6, 15), 0.02)
@@ -47,8 +46,7 @@ def test_second_pass_replaces_only_the_given_datasets(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_result(path).pose[:6], pose)
 
 
-def test_smoothed_copy_is_stored_separately_and_can_replace_the_raw_values(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_smoothed_copy_is_stored_separately_and_can_replace_the_raw_values(path: Path) -> None:
     write(path, 6)
     smoothed = make_smoothed(6)
     revise_result(path, smoothed=smoothed)
@@ -70,8 +68,7 @@ def test_smoothed_copy_is_stored_separately_and_can_replace_the_raw_values(tmp_p
     assert again is not None and again.keys() == {"bridged"}
 
 
-def test_smoothed_copy_is_deleted_when_its_source_changes(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_smoothed_copy_is_deleted_when_its_source_changes(path: Path) -> None:
     write(path, 4)
     revise_result(path, smoothed=make_smoothed(4))
     resume(path, 4)
@@ -93,8 +90,7 @@ def test_smoothed_copy_is_deleted_when_its_source_changes(tmp_path: Path) -> Non
         {"smoothed": {"status": np.zeros(4), "bridged": np.zeros(4)}},
     ],
 )
-def test_second_pass_of_wrong_shape_changes_nothing(tmp_path: Path, change: dict[str, Any]) -> None:
-    path = tmp_path / "result.h5"
+def test_second_pass_of_wrong_shape_changes_nothing(path: Path, change: dict[str, Any]) -> None:
     write(path, 4)
     before = path.read_bytes()
     with pytest.raises(ValueError):
@@ -102,8 +98,7 @@ def test_second_pass_of_wrong_shape_changes_nothing(tmp_path: Path, change: dict
     assert path.read_bytes() == before
 
 
-def test_failed_second_pass_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "result.h5"
+def test_failed_second_pass_changes_nothing(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(path, 4)
     before = path.read_bytes()
 
@@ -117,8 +112,7 @@ def test_failed_second_pass_changes_nothing(tmp_path: Path, monkeypatch: pytest.
     assert [entry.name for entry in tmp_path.iterdir()] == ["result.h5"]
 
 
-def test_second_pass_refuses_a_result_that_is_being_written(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_second_pass_refuses_a_result_that_is_being_written(path: Path, tmp_path: Path) -> None:
     with ResultWriter.create(path, META) as writer:
         append(writer, 0)
         with pytest.raises(ResultError, match="another run"):

@@ -30,8 +30,7 @@ def test_docs_list_every_dataset_of_the_schema() -> None:
     assert sorted(listed) == sorted(f"/{path}" for path in (*(entry.path for entry in SCHEMA), *groups))
 
 
-def test_every_dataset_of_a_file_is_in_the_schema(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_every_dataset_of_a_file_is_in_the_schema(path: Path) -> None:
     write(path, 3)
     revise_result(path, smoothed=make_smoothed(3), cameras=make_cameras(), model={"height_m": 1.7})
     known = {*columns_of(META), *(entry.path for entry in SCHEMA)}

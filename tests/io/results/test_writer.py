@@ -31,8 +31,7 @@ from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.skeleton import JOINTS, build_skeleton, paper_poses
 
 
-def test_written_values_are_read_back(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_written_values_are_read_back(path: Path, tmp_path: Path) -> None:
     model = {"torso/radii_m": np.array([0.1, 0.2]), "height_m": 1.78, "sex": "any"}
     with ResultWriter.create(path, META) as writer:
         writer.write_model(model)
@@ -60,8 +59,7 @@ def test_written_values_are_read_back(tmp_path: Path) -> None:
     assert result.cameras is None and result.smoothed is None
 
 
-def test_layout_is_the_contract(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_layout_is_the_contract(path: Path) -> None:
     write(path, 2)
     expected: dict[str, tuple[tuple[int, ...], str, dict[str, Any]]] = {
         "frames": ((2,), "int64", {}),
@@ -99,8 +97,7 @@ def test_layout_is_the_contract(tmp_path: Path) -> None:
     assert path.read_bytes()[8] < 3
 
 
-def test_appended_frame_is_in_the_file_immediately(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_appended_frame_is_in_the_file_immediately(path: Path, tmp_path: Path) -> None:
     with ResultWriter.create(path, META) as writer:
         for index in range(5):
             append(writer, index)
@@ -110,9 +107,8 @@ def test_appended_frame_is_in_the_file_immediately(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("done", [0, 2])
-def test_frames_not_yet_flushed_are_kept_when_the_run_ends(tmp_path: Path, done: int) -> None:
+def test_frames_not_yet_flushed_are_kept_when_the_run_ends(path: Path, done: int) -> None:
     """Whether one is in the file already, or an older result is still there."""
-    path = tmp_path / "result.h5"
     write(path, 1)
     older = path.read_bytes()
     with pytest.raises(KeyboardInterrupt), ResultWriter.create(path, META) as writer:
@@ -123,8 +119,7 @@ def test_frames_not_yet_flushed_are_kept_when_the_run_ends(tmp_path: Path, done:
     assert assert_complete(path, done + 3) == done + 3
 
 
-def test_arrays_may_be_reused_after_append(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_arrays_may_be_reused_after_append(path: Path) -> None:
     pose, mean = np.zeros(24), np.zeros(3)
     with ResultWriter.create(path, META) as writer:
         for index in range(4):
@@ -136,8 +131,7 @@ def test_arrays_may_be_reused_after_append(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_result(path).state["mean"], np.full(3, 3.0))
 
 
-def test_model_can_be_replaced_during_the_run(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_model_can_be_replaced_during_the_run(path: Path) -> None:
     with ResultWriter.create(path, META) as writer:
         writer.write_model({"height_m": 1.7, "guess": 1.0})
         append(writer, 0, 1)
@@ -146,8 +140,7 @@ def test_model_can_be_replaced_during_the_run(tmp_path: Path) -> None:
     assert read_result(path).model == {"height_m": 1.8}
 
 
-def test_state_may_change_its_shape_and_names(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_state_may_change_its_shape_and_names(path: Path) -> None:
     states: list[dict[str, Value]] = [
         {"a": np.zeros(3), "b": "text"},
         {"a": np.ones((2, 2), dtype=np.float32), "b": "a longer text", "c": 5},
@@ -175,8 +168,7 @@ def test_state_may_change_its_shape_and_names(tmp_path: Path) -> None:
         {"hull/positions": np.zeros((4, 3)), "hull/colors": np.zeros((5, 3))},
     ],
 )
-def test_wrong_frame_is_refused_and_earlier_frames_are_kept(tmp_path: Path, change: dict[str, Any]) -> None:
-    path = tmp_path / "result.h5"
+def test_wrong_frame_is_refused_and_earlier_frames_are_kept(path: Path, change: dict[str, Any]) -> None:
     with ResultWriter.create(path, META) as writer:
         append(writer, 0)
         with pytest.raises(ValueError, match=list(change)[-1]):
@@ -190,9 +182,8 @@ def test_wrong_frame_is_refused_and_earlier_frames_are_kept(tmp_path: Path, chan
 # --- optional values --------------------------------------------------------------------------------------------------
 
 
-def test_undeclared_datasets_are_absent(tmp_path: Path) -> None:
+def test_undeclared_datasets_are_absent(path: Path) -> None:
     """Also those of pose and joints have no columns in a result that has only a hull."""
-    path = tmp_path / "result.h5"
     plain = replace(
         META, sigma=False, residual_cameras=(), mask_sources=(), segment_names=(), feet=False, angles=(),
         objective_kind="", pose_names=(), pose_units=(), joint_names=(), stages=(),
@@ -210,17 +201,15 @@ def test_undeclared_datasets_are_absent(tmp_path: Path) -> None:
         read_joints(path)
 
 
-def test_suspect_frames_have_a_pose_and_absent_frames_have_none(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_suspect_frames_have_a_pose_and_absent_frames_have_none(path: Path) -> None:
     with ResultWriter.create(path, META) as writer:
         for status in Status:
             writer.append({0: make_frame(int(status)) | {"status": status}})
     assert read_result(path).has_pose.tolist() == [True, True, True, False, True, False]
 
 
-def test_paper_pose_is_derived_from_the_names_of_the_pose(tmp_path: Path) -> None:
+def test_paper_pose_is_derived_from_the_names_of_the_pose(path: Path) -> None:
     skeleton = build_skeleton(BodyDimensions.from_stature(1.7))
-    path = tmp_path / "result.h5"
     pose = skeleton.clip(np.linspace(-0.3, 0.3, 31))
     with ResultWriter.create(path, replace(META, pose_names=skeleton.names, pose_units=skeleton.units)) as writer:
         writer.append({0: make_frame(0) | {"pose": pose}})
@@ -239,8 +228,7 @@ def test_metadata_that_contradict_themselves_are_refused() -> None:
         UsedCameras(make_cameras().rig, np.zeros(3))
 
 
-def test_cameras_can_be_replaced_and_are_kept_by_a_resumed_run(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_cameras_can_be_replaced_and_are_kept_by_a_resumed_run(path: Path) -> None:
     write(path, 1)
     for shift_m in (0.0, 0.5):
         revise_result(path, cameras=make_cameras(shift_m))
@@ -256,8 +244,7 @@ def test_cameras_can_be_replaced_and_are_kept_by_a_resumed_run(tmp_path: Path) -
 # --- joints -----------------------------------------------------------------------------------------------------------
 
 
-def test_joints_of_a_result(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
+def test_joints_of_a_result(path: Path) -> None:
     write(path, 3)
     track, result = read_joints(path), read_result(path)
     np.testing.assert_array_equal(track.frames, [3, 4, 5])
