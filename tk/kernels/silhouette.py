@@ -51,7 +51,6 @@ _NUMBERS = tuple(range(11))
 SCALE, WINDOW, SPACING, AMBIGUOUS, TANGENTIAL, ROBUST, LOST, COLORS, MOST_SAMPLES, INTERIOR, EXPORT = _NUMBERS
 # Columns of ``sums``: cost, weight of the samples that found an edge, weight of all, steps made; then the gradient.
 COST, FOUND, ALL, STEPS, GRADIENT = range(5)
-_NO_REGIONS = Regions(np.zeros((1, 1, 1, 3), np.uint8), np.zeros((1, COLOR_BINS), np.float32), 0.0)
 
 
 class Silhouettes(NamedTuple):
@@ -356,7 +355,7 @@ def _launch(
     state = np.array(poses, np.float64)
     B, D = state.shape
     V, Q, P = len(seen.cameras), len(body.curves), len(body.parts)
-    regions = regions or _NO_REGIONS
+    regions = regions or _no_regions()
     if len(seen.masks) not in (V, B * V):
         raise ValueError(f"{len(seen.masks)} masks of {V} views: one set, or one for each frame of the {B} poses")
     sums, hessian = np.empty((B, GRADIENT + D)), np.zeros((B, D, D))
@@ -391,6 +390,11 @@ def _numbers(s: SearchSettings, scale: float, weight: float, export: bool, dtype
     """Pack the settings in the order from SCALE to EXPORT."""
     pixels = scale, s.window_px, s.spacing_px, s.ambiguous_px, s.tangential, s.robust_px, s.lost_px
     return np.array((*pixels, weight, s.most_samples, s.interior, export), dtype)
+
+
+@functools.cache
+def _no_regions() -> Regions:
+    return Regions(np.zeros((1, 1, 1, 3), np.uint8), np.zeros((1, COLOR_BINS), np.float32), 0.0)
 
 
 @functools.lru_cache(32)
