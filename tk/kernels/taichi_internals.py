@@ -1,17 +1,17 @@
 """Uses of Taichi's internals, for speed only. With an unknown Taichi version they do nothing.
 
-:class:`Launcher` makes launches cost a third. Taichi spends 6 µs on each array of a launch, mostly to determine its
-type, its place in the compiled kernel and the context again. A Launcher leaves that to Taichi at the first call, stores
-the compiled kernel and its context, and from then on passes pointers to the arrays that changed: 2 µs each.
+:class:`Launcher` reduces the cost of a launch to a third. Taichi spends 6 µs on each array of a launch, mostly to find
+its type and its place in the compiled kernel again. A Launcher makes the first launch by Taichi, stores the compiled
+kernel and its context, and then passes pointers to the arrays that changed: 2 µs each.
 
-:func:`shorten_notes` halves the time of the Python transformation of kernels at each start. For each node of a kernel's
+:func:`shorten_notes` halves the time in which Python transforms the kernels at each start. For each node of a kernel's
 syntax tree Taichi notes its position for error messages, with the line of code wrapped to 80 columns and underlined.
-For each call of a ``@ti.func`` it reads that function's source again. Shortened notes have file, line and code only,
-for the kernels of this package, and each source is read once.
+For each call of a ``@ti.func`` it reads that function's source again. Shortened notes, for the kernels of this package,
+have file, line and code only, and each source is read once.
 
-:func:`quick_import` and :func:`quick_decorators` halve the time of importing Taichi and the kernels. For each decorated
-function Taichi searches the sources of all modules for the line that called, to know whether a class contains it. The
-frame itself says so.
+:func:`quick_import` and :func:`quick_decorators` halve the time of importing Taichi and the kernels. To know whether a
+class contains a decorated function, Taichi searches the sources of all modules for the decorator's line. The caller's
+frame shows it at once.
 """
 
 from __future__ import annotations
@@ -40,8 +40,42 @@ def program() -> Any:
 # --- launches ----------------------------------------------------------------------------------------------------
 
 
-def _nothing() -> None:
-    """Stand for a weak reference to an array before the first call."""
+class _Number:
+    """An argument that is a number."""
+
+    __slots__ = ("_index", "_kind", "_last")
+
+    def __init__(self, index: int, kind: type[int] | type[float]) -> None:
+        self._index, self._kind, self._last = (index,), kind, None
+
+    def put(self, context: Any, value: Any) -> None:
+        """Put the value into the context of a launch, unless it is there already."""
+        if value != self._last:
+            set_number = context.set_arg_float if self._kind is float else context.set_arg_int
+            set_number(self._index, self._kind(value))
+            self._last = value
+
+
+class _Array:
+    """An argument that is an array like that of the first call."""
+
+    __slots__ = ("_dtype", "_index", "_last", "_ndim")
+
+    def __init__(self, index: int, first: np.ndarray) -> None:
+        self._index, self._dtype, self._ndim = (index,), first.dtype, first.ndim
+        self._last: Callable[[], np.ndarray | None] = lambda: None
+
+    def put(self, context: Any, value: np.ndarray) -> None:
+        """Put a pointer to the array into the context of a launch, unless it is there already."""
+        if self._last() is value:
+            return
+        if value.dtype != self._dtype or value.ndim != self._ndim or not value.flags.c_contiguous:
+            raise TypeError(
+                f"argument {self._index[0]} is {value.dtype} of {value.ndim} dimensions, contiguous: "
+                f"{value.flags.c_contiguous}; the first call had {self._dtype} of {self._ndim}"
+            )
+        context.set_arg_external_array_with_shape(self._index, value.ctypes.data, value.nbytes, value.shape, 0)
+        self._last = weakref.ref(value)  # keeps no array alive
 
 
 class Launcher:
@@ -58,48 +92,25 @@ class Launcher:
     def __init__(self, kernel: Callable[..., None], *constants: np.ndarray) -> None:
         self._kernel = kernel
         self._constants = constants
+        self._lock = threading.Lock()
+        # of the first call: Taichi's program, the compiled kernel, its context, and the places of the arguments in it
         self._program: Any = None
         self._compiled: Any = None
         self._context: Any = None
-        self._expected: list[tuple[tuple[int], Any, int]] = []
-        self._lock = threading.Lock()
-        # the context's numbers, and weak references to its arrays: no array is kept alive longer than its user needs it
-        self._last: list[Any] = []
+        self._arguments: list[_Number | _Array] = []
 
-    def __call__(self, *arguments: Any) -> None:
+    def __call__(self, *values: Any) -> None:
         with self._lock:
             running = program()
             if self._compiled is None or self._program is not running:
-                self._kernel(*self._constants, *arguments)
-                self._remember(arguments)
+                self._kernel(*self._constants, *values)
+                self._remember(values)
                 return
-            self._update(arguments)
-            self._launch(running, self._context)
+            for argument, value in zip(self._arguments, values, strict=True):
+                argument.put(self._context, value)
+            running.launch_kernel(self._compiled, self._context)
 
-    def _update(self, arguments: tuple[Any, ...]) -> None:
-        context, last = self._context, self._last
-        for i, ((slot, kind, ndim), value) in enumerate(zip(self._expected, arguments, strict=True)):
-            if kind is float or kind is int:
-                if value != last[i]:
-                    set_number = context.set_arg_float if kind is float else context.set_arg_int
-                    set_number(slot, kind(value))
-                    last[i] = value
-                continue
-            if last[i]() is value:
-                continue
-            if value.dtype == kind and value.ndim == ndim and value.flags.c_contiguous:
-                context.set_arg_external_array_with_shape(slot, value.ctypes.data, value.nbytes, value.shape, 0)
-            else:
-                raise TypeError(
-                    f"argument {slot[0]} is {value.dtype} of {value.ndim} dimensions, "
-                    f"contiguous: {value.flags.c_contiguous}; the first call had {kind} of {ndim}"
-                )
-            last[i] = weakref.ref(value)
-
-    def _launch(self, running: Any, context: Any) -> None:
-        running.launch_kernel(self._compiled, context)
-
-    def _remember(self, arguments: tuple[Any, ...]) -> None:
+    def _remember(self, values: tuple[Any, ...]) -> None:
         """Store the kernel that the last call compiled; nothing if this Taichi is an unknown version."""
         taichi = sys.modules["taichi"]
         try:
@@ -107,26 +118,21 @@ class Launcher:
             if running.config().debug:
                 return
             primal = self._kernel._primal  # type: ignore[attr-defined]
-            everything = (*self._constants, *arguments)
-            source = primal.compiled_kernels[primal.ensure_compiled(*everything)]
+            source = primal.compiled_kernels[primal.ensure_compiled(*self._constants, *values)]
             compiled = running.compile_kernel(running.config(), running.get_device_caps(), source)
-            annotations = [argument.annotation for argument in primal.arguments]
+            types = [argument.annotation for argument in primal.arguments]
         except (AttributeError, KeyError, TypeError):
             return
-        first = len(self._constants)
-        if not all(a.flags.c_contiguous for a in self._constants):
+        if not all(array.flags.c_contiguous for array in self._constants):
             return
         context = source.make_launch_context()
-        for i, a in enumerate(self._constants):
-            context.set_arg_external_array_with_shape((i,), a.ctypes.data, a.nbytes, a.shape, 0)
+        for i, array in enumerate(self._constants):
+            _Array(i, array).put(context, array)
         whole = taichi.i32, taichi.i64
-        self._expected = [
-            ((i,), value.dtype, value.ndim)
-            if isinstance(value, np.ndarray)
-            else ((i,), int if annotations[i] in whole else float, 0)
-            for i, value in enumerate(arguments, first)
+        self._arguments = [
+            _Array(i, value) if isinstance(value, np.ndarray) else _Number(i, int if types[i] in whole else float)
+            for i, value in enumerate(values, len(self._constants))
         ]
-        self._last = [_nothing if kind is not int and kind is not float else None for _, kind, _ in self._expected]
         self._program, self._context, self._compiled = running, context, compiled
 
 
