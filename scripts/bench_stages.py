@@ -117,8 +117,7 @@ def silhouette_stages(
     variants = limb.candidates(pose[0], NEARBY, np.random.default_rng(0))
     evidence = Evidence.of(RayGrid(capture.rig, SCREEN_ROWS), last.masks[0])
     drawn = np.setdiff1d(np.arange(len(body.parts), dtype=np.int32), limb.parts)
-    _, rest = evidence.cast(body, pose, drawn, export=True)
-    assert rest is not None
+    _, rest = evidence.cast(body, pose, drawn)
     others = Cast(rest.label[0], rest.depth[0])
     limits = None, body.skeleton.lower, body.skeleton.upper
 
@@ -145,10 +144,10 @@ def silhouette_stages(
             statistics.median(median_ms(partial(fit, *frame), 3) for frame in zip(poses, pyramids, strict=True)),
             {},
         ),
-        Stage("E_S of a pose", median_ms(lambda: evidence.cast(body, pose)), {}),
+        Stage("E_S of a pose", median_ms(lambda: evidence.costs(body, pose)), {}),
         Stage(
             f"E_S of {len(variants)} places of an arm",
-            median_ms(lambda: evidence.cast(body, variants, limb.parts, others)),
+            median_ms(lambda: evidence.costs(body, variants, limb.parts, others)),
             {},
         ),
     ]

@@ -22,7 +22,6 @@ import numpy as np
 
 from scripts.ablation import Recorded
 from tk.model.body.limb_candidates import Limb
-from tk.model.cues.ray_costs import mean_of_views
 from tk.trackers.protocol import Observation
 from tk.trackers.region import RegionTracker
 
@@ -60,16 +59,15 @@ class Trials(RegionTracker):
         evidence = self.evidence(self.screen, frame, pyramid)
         pose = self._best.pose
         rng = np.random.default_rng(frame.index)
-        own = float(mean_of_views(evidence.cast(self.body, pose[None])[0])[0])
+        own = float(evidence.costs(self.body, pose[None])[0])
         for limb in self.limbs:
             places = limb.candidates(pose, 0, rng)
-            cost = mean_of_views(evidence.cast(self.body, places)[0])
+            cost = evidence.costs(self.body, places)
             allowed = np.flatnonzero((self._off(limb, places, pose) > DISPLACED_M) & (cost < own + ALLOWED))
             for k in rng.choice(allowed, min(TRIES, len(allowed)), replace=False):
                 wrong = self.settle(pyramid, places[k][None], (1, 0), frame.images).states
-                by_view, met = evidence.cast(self.body, wrong, export=True)
-                assert met is not None
-                if self._off(limb, wrong, pose)[0] < OFF_M or mean_of_views(by_view)[0] < own + WORSE:
+                worse, met = evidence.cast(self.body, wrong)
+                if self._off(limb, wrong, pose)[0] < OFF_M or worse[0] < own + WORSE:
                     continue
                 misplaced = self.misplaced(evidence, met.label[0])
                 started = time.perf_counter()

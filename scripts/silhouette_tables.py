@@ -133,8 +133,7 @@ def track(data: Sequence3D, name: str, views: int, config: Variant) -> tuple[Row
     error = []
     for i in range(0, len(frames), every):
         pose = estimates[i].pose
-        shares, _ = Evidence.of(grid, data.masks[i]).cast(body, pose[None])
-        error.append(np.nanmean(shares))
+        error.append(Evidence.of(grid, data.masks[i]).costs(body, pose[None])[0])
     found, true = joints[:, ANKLES], data.truth[:, ANKLES]
     off, height = [], []
     for camera in rig:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import Silent, Tk
+from tests.model.figures import draw_silhouettes
 from tk.evaluation.views import capture_of, evaluate_views
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
@@ -18,7 +19,6 @@ from tk.io.results.reader import read_joints, read_result
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.joints import ROWS
 from tk.model.body.skeleton import JOINTS, Skeleton, skeleton_of_names
-from tk.model.masks.silhouettes import draw_silhouettes
 from tk.run.session import track
 from tk.trackers.bodies import body_and_poses
 

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from scripts.synthetic.capture import write_calibration
 from tests.conftest import Tk
 from tests.io.conftest import write_picture
+from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tk.errors import CaptureError
 from tk.inspection.leveling import Leveling, find_up, write_up
@@ -24,7 +25,6 @@ from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.up import up_vector
-from tk.model.masks.silhouettes import draw_silhouettes
 
 
 def turned(folder: Path, camera: int, degrees: float) -> None:

@@ -12,13 +12,13 @@ import pytest
 from scripts.synthetic.capture import write_calibration
 from tests.conftest import Tk
 from tests.io.conftest import write_picture
+from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tk.inspection.people import PeopleWatch
 from tk.io.captures.capture import open_capture
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
-from tk.model.masks.silhouettes import draw_silhouettes
 from tk.model.people import LocatedPerson, PeopleFinder
 
 FRAMES = 24

@@ -9,12 +9,12 @@ from tests.model.figures import BODY
 from tests.model.ring import ring_of_cameras
 from tk.kernels.cones import CONE
 from tk.kernels.projection import pack_cameras
-from tk.kernels.raycast import FAR, Cast, cast, nothing
+from tk.kernels.raycast import FAR, Cast, Rays, cast, costs, nothing
 from tk.model.body import gait_poses as gait
 from tk.model.body.cone_body import COLOR_GROUPS, ConeBody
 from tk.model.body.skeleton import CHAINS, SEGMENTS
 from tk.model.cameras.camera import Rig
-from tk.model.masks.silhouettes import pixel_rays
+from tk.model.cues.ray_costs import pixel_rays
 
 RIG = ring_of_cameras(3, width=160, height=200)
 STEP = 4
@@ -84,8 +84,11 @@ def brute_force(
     return label, depth
 
 
+GRID = Rays(pack_cameras(RIG), STEP, RAYS)
+
+
 def cast_all(body: ConeBody, poses: np.ndarray, dtype: type = np.float64, **options):
-    return cast(body.pack(dtype), pack_cameras(RIG), STEP, RAYS, COST, poses, **options)
+    return cast(body.pack(dtype), GRID, COST, poses, **options)
 
 
 def cost_of(label: np.ndarray) -> float:
@@ -95,8 +98,8 @@ def cost_of(label: np.ndarray) -> float:
 
 
 def test_rays_meet_what_brute_force_says():
-    total, met = cast_all(BODY, POSES, export=True)
-    assert met is not None and total.shape == (len(POSES), V)
+    total, met = cast_all(BODY, POSES)
+    assert total.shape == (len(POSES), V)
     for b, pose in enumerate(POSES):
         label, depth = brute_force(BODY, pose)
         sure = np.ones(label.shape, bool)
@@ -121,8 +124,7 @@ def test_lenses_that_bend_lines_hide_no_part(fisheye: bool) -> None:
     center = np.array([[0, 0, c] for c in (319.5, 399.5)] + [[0, 0, 0]]) * (1 - focal[0, 0])
     rig = Rig(tuple(replace(c, matrix=focal @ c.matrix + center, distortions=bent, fisheye=fisheye) for c in near))
     rays = pixel_rays(rig, 4 * STEP)
-    _, met = cast(BODY.pack(np.float64), pack_cameras(rig), 4 * STEP, rays, COST, POSES, export=True)
-    assert met is not None
+    _, met = cast(BODY.pack(np.float64), Rays(pack_cameras(rig), 4 * STEP, rays), COST, POSES)
     for b, pose in enumerate(POSES):
         label = brute_force(BODY, pose, 1.0, rig, rays)[0]
         sure = np.ones(label.shape, bool)
@@ -139,12 +141,12 @@ def test_the_rest_may_be_cast_before():
     poses = np.repeat(POSES[:1], 4, axis=0)
     arm = BODY.skeleton.chain_dofs("arm_l")
     poses[:, arm] += np.random.default_rng(6).normal(0, 0.8, (4, arm.sum()))
-    expected, whole = cast_all(BODY, poses, np.float32, export=True)
+    expected, whole = cast_all(BODY, poses, np.float32)
     for first, second in ((others, parts), (parts, others)):
         for b in range(4):
-            _, rest = cast_all(BODY, poses[b : b + 1], np.float32, drawn=first, export=True)
+            _, rest = cast_all(BODY, poses[b : b + 1], np.float32, drawn=first)
             before = Cast(rest.label[0].copy(), rest.depth[0].copy())
-            total, met = cast_all(BODY, poses[b : b + 1], np.float32, drawn=second, before=before, export=True)
+            total, met = cast_all(BODY, poses[b : b + 1], np.float32, drawn=second, before=before)
             np.testing.assert_allclose(total[0], expected[b], rtol=1e-5)
             np.testing.assert_array_equal(met.label[0], whole.label[b])
             np.testing.assert_array_equal(met.depth[0], whole.depth[b])
@@ -152,28 +154,26 @@ def test_the_rest_may_be_cast_before():
 
 
 def test_without_export_the_costs_are_the_same_and_in_any_batch():
-    with_labels, _ = cast_all(BODY, POSES, np.float32, export=True)
-    without, nothing_else = cast_all(BODY, POSES, np.float32)
-    assert nothing_else is None
+    with_labels, _ = cast_all(BODY, POSES, np.float32)
+    without = costs(BODY.arrays, GRID, COST, POSES)
     np.testing.assert_array_equal(without, with_labels)
-    np.testing.assert_array_equal(cast_all(BODY, POSES[1:2], np.float32)[0][0], without[1])
+    np.testing.assert_array_equal(costs(BODY.arrays, GRID, COST, POSES[1:2])[0], without[1])
 
 
 def test_two_columns_of_costs_suffice_without_colors():
     few = np.ascontiguousarray(COST[..., :2])
-    total, met = cast(BODY.arrays, pack_cameras(RIG), STEP, RAYS, few, POSES, export=True)
+    total, met = cast(BODY.arrays, GRID, few, POSES)
     many = np.repeat(few, [1, len(COLOR_GROUPS)], axis=-1)
-    expected, _ = cast(BODY.arrays, pack_cameras(RIG), STEP, RAYS, many, POSES)
-    np.testing.assert_array_equal(total, expected)
+    np.testing.assert_array_equal(total, costs(BODY.arrays, GRID, many, POSES))
     before = Cast(met.label[0].copy(), met.depth[0].copy())
-    again, _ = cast(BODY.arrays, pack_cameras(RIG), STEP, RAYS, few, POSES[:1], before=before)
+    again = costs(BODY.arrays, GRID, few, POSES[:1], before=before)
     np.testing.assert_allclose(again[0], total[0], rtol=1e-6)
 
 
 def test_a_body_out_of_sight_costs_what_nothing_costs():
     away = POSES[:1].copy()
     away[:, 2] += 50.0
-    total, met = cast_all(BODY, away, export=True)
+    total, met = cast_all(BODY, away)
     assert not met.label.any()
     np.testing.assert_allclose(total[0], COST[..., 0].sum(axis=(1, 2)), rtol=1e-5)
     empty = nothing((V, H, W))
@@ -186,5 +186,5 @@ def test_a_smaller_picture_has_no_rays_outside():
     rays = pixel_rays(narrow, STEP)
     outside = ~rays.any(axis=-1)
     assert outside[1].any() and not outside[[0, 2]].any()
-    _, met = cast(BODY.arrays, pack_cameras(narrow), STEP, rays, COST, POSES[:1], export=True)
+    _, met = cast(BODY.arrays, Rays(pack_cameras(narrow), STEP, rays), COST, POSES[:1])
     assert not met.label[0][outside].any() and met.label[0][1].any()

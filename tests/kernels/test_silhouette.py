@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from tests.model.figures import BODY, scaled, surface_points
+from tests.model.figures import BODY, draw_silhouettes, scaled, surface_points
 from tests.model.ring import ring_of_cameras
 from tk.errors import ConfigError
 from tk.kernels import silhouette
@@ -21,7 +21,7 @@ from tk.model.body import gait_poses as gait
 from tk.model.body.body_parameters import BodyFamily
 from tk.model.body.cone_body import build_cone_body
 from tk.model.cameras.camera import Rig
-from tk.model.masks.silhouettes import Views, draw_silhouettes
+from tk.model.masks.silhouettes import Views
 
 D = len(BODY.skeleton.names)
 FAMILY = BodyFamily(BODY.dimensions, 0.01)

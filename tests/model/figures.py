@@ -10,7 +10,9 @@ from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.skeleton import SEGMENTS
 from tk.model.body.superellipsoid_body import SPACING_M, SuperellipsoidBody, build_superellipsoid_body
+from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume, VoxelGrid
+from tk.model.cues.ray_costs import RayGrid
 
 DIMENSIONS = BodyDimensions.from_stature(1.75)
 BODY = build_cone_body(DIMENSIONS)
@@ -25,6 +27,13 @@ def surface_points(body: ConeBody, pose: np.ndarray, part: np.ndarray, unscaled:
     """Return world points (N, 3) on the surface of parts (N,), see :meth:`ConeBody.local`."""
     T = body.part_transforms(body.skeleton.segment_transforms(pose))[part]
     return (T[:, :3, :3] @ body.local(part, unscaled)[:, :, None])[:, :, 0] + T[:, :3, 3]
+
+
+def draw_silhouettes(body: ConeBody, rig: Rig, poses: np.ndarray) -> np.ndarray:
+    """Render silhouettes (B, V, H, W) of the body at poses (B, D), 0 or 255."""
+    grid = RayGrid(rig, rig.frame_shape[0])
+    drawn = [grid.render(body, pose[None]).label[0] > 0 for pose in poses]  # one by one, to save memory
+    return np.where(drawn, np.uint8(255), np.uint8(0))
 
 
 def skin_of(dimensions: BodyDimensions, up: str = "z", spacing_m: float = SPACING_M) -> SuperellipsoidBody:

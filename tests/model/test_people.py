@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import scipy.ndimage
 
+from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume
-from tk.model.masks.silhouettes import draw_silhouettes
 from tk.model.people import LocatedPerson, PeopleFinder, components, order_people
 
 RIG = ring_of_cameras(5, 240, 240)

@@ -12,6 +12,7 @@ import pytest
 
 from tests.conftest import QUICK, Silent, Tk
 from tests.made_results import write_motion
+from tests.model.figures import draw_silhouettes
 from tk.errors import ResultError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
@@ -25,7 +26,6 @@ from tk.model.body.gait_poses import neutral_pose
 from tk.model.body.joints import BONES
 from tk.model.body.skeleton import JOINTS, build_skeleton
 from tk.model.cameras.camera import Camera, Rig
-from tk.model.masks.silhouettes import draw_silhouettes
 from tk.render.canvas import View, dots, draw_body, draw_joints
 from tk.render.figure import Figure, Seen, solids_of
 from tk.render.overlay import Grid, Overlay, write_sheets

@@ -14,6 +14,7 @@ import pytest
 import tomli_w
 
 from tests.conftest import FRAMES, QUICK, Silent, Tk
+from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tk.io import settings_file
 from tk.io.captures.calibration import read_calibration
@@ -28,7 +29,6 @@ from tk.model.body.cone_body import build_cone_body
 from tk.model.cameras.bundle import TrackedPoses
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.refinement import turn_between
-from tk.model.masks.silhouettes import draw_silhouettes
 from tk.run import offline as finish
 from tk.run.refinement import refine_capture, retimed, whole_delays
 from tk.run.session import track

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import QUICK, Silent, refused
+from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, STATURE, walk
 from tk.errors import CaptureError
@@ -22,7 +23,6 @@ from tk.io.results.data import Result, UsedCameras
 from tk.io.results.reader import read_result
 from tk.io.results.status import Status
 from tk.model.cameras.volume import Volume
-from tk.model.masks.silhouettes import draw_silhouettes
 from tk.model.setup import Setup, Subject
 from tk.run import offline
 from tk.run.choice import Choice

@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tk.errors import CaptureError
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.model.body.gait_poses import neutral_pose, standing_pose, walking_pose
 from tk.model.body.skeleton import JOINTS, shoulder_angles
-from tk.model.masks.silhouettes import draw_silhouettes
 from tk.model.setup import Subject
 from tk.optim.gauss_newton import BatchSolution
 from tk.settings import SilhouetteSettings

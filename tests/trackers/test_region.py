@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.model.figures import scaled
+from tests.model.figures import draw_silhouettes, scaled
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, EMPTY, NAMES, STATURE, errors, find_again_elsewhere, observe, walk
 from tk.errors import CaptureError
@@ -18,7 +18,6 @@ from tk.model.body.limb_candidates import exchanged, pairs
 from tk.model.body.skeleton import JOINTS, shoulder_angles
 from tk.model.cameras.camera import Rig
 from tk.model.cues.ray_costs import Evidence, RayGrid
-from tk.model.masks.silhouettes import draw_silhouettes
 from tk.model.setup import InitPose, Subject
 from tk.settings import RegionSettings, SilhouetteSettings
 from tk.trackers.region import UNKNOWN_AFTER, RegionTracker
@@ -306,7 +305,7 @@ def clothed(poses: np.ndarray) -> np.ndarray:
     worn = np.array([(90, 90, 90), *(SHADES.get(COLOR_GROUPS[g], (45, 60, 40)) for g in BODY.color_group)], np.uint8)
     grid = RayGrid(FRONT, FRONT.frame_shape[0])
     nobody = np.zeros(grid.rays.shape[:3], np.uint8)
-    _, met = Evidence.of(grid, nobody).cast(BODY, poses, export=True)
+    _, met = Evidence.of(grid, nobody).cast(BODY, poses)
     assert met is not None
     return worn[met.label]
 

@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from tests.model.figures import scaled
+from tests.model.figures import draw_silhouettes, scaled
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, NAMES, STATURE, errors, find_again_elsewhere, observe, walk
 from tk.errors import CaptureError
 from tk.model.body.cone_body import build_cone_body
 from tk.model.body.skeleton import JOINTS
-from tk.model.masks.silhouettes import draw_silhouettes
 from tk.model.setup import InitPose, Subject
 from tk.settings import SilhouetteSettings
 from tk.trackers.silhouette import SilhouetteTracker

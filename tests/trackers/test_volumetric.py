@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, STATURE, errors, observe, walk
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.volume import Volume
-from tk.model.masks.silhouettes import draw_silhouettes
 from tk.model.setup import Subject
 from tk.settings import Settings, VolumetricSettings
 from tk.trackers.volumetric import VolumetricTracker

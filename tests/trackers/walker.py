@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from tests.model.figures import draw_silhouettes
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.model.body.gait_poses import walking_pose
 from tk.model.cameras.camera import Rig
-from tk.model.masks.silhouettes import draw_silhouettes
 from tk.trackers.contour_tracker import ContourTracker
 from tk.trackers.protocol import Estimate, Observation
 

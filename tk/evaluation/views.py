@@ -26,7 +26,8 @@ from tk.io.results.data import Result
 from tk.io.results.reader import as_damage_error, read_joints, read_result
 from tk.model.body.joints import ANKLE_JOINTS, JOINTS
 from tk.model.cameras.camera import Rig
-from tk.model.masks.silhouettes import SilhouetteRenderer, share_wrong
+from tk.model.cues.ray_costs import RayGrid
+from tk.model.masks.silhouettes import share_wrong
 from tk.trackers.bodies import body_and_poses
 
 Float = NDArray[np.float64]
@@ -158,12 +159,13 @@ def _silhouette_errors(result: Result, capture: Capture) -> tuple[list[float] | 
     body, poses = found
     row_of = {int(frame): row for row, frame in enumerate(result.frames)}
     first, last = int(result.frames.min()), int(result.frames.max())
-    errors, renderer = [], SilhouetteRenderer(body, capture.rig)
+    errors, grid = [], RayGrid(capture.rig, capture.rig.frame_shape[0])
     with capture.frames(first, last + 1) as frames:
         for frame in frames:
             row = row_of.get(frame.index)
             if row is not None and frame.masks is not None and np.isfinite(result.pose[row]).all():
-                errors.append(share_wrong(renderer.draw(poses[row]), frame.masks))
+                drawn = grid.render(body, poses[row][None]).label[0] > 0
+                errors.append(share_wrong(np.where(drawn, np.uint8(255), np.uint8(0)), frame.masks))
     values = np.array(errors).reshape(-1, len(capture.rig))
     seen = np.isfinite(values)  # NaN for an empty mask
     if not seen.any(axis=0).all():

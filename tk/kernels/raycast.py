@@ -37,15 +37,22 @@ MARGIN, BEND = 1.1, 1.5
 # Columns of a part's outline in an image: capsule's begin, axis, radius, and the radius across the axis; then the
 # camera's centre in the unit part, and the pixel of the part's middle.
 _BEGIN, _AXIS, _RADIUS, _ACROSS, _ORIGIN, _MIDDLE, _COLUMNS = 0, 2, 4, 5, 7, 10, 12
-# Columns of the packed settings: pixels between rays, of which the first is at step // 2; see cast(); 1 to write labels
-# and depths.
+# Columns of the packed settings: see Rays and costs(); 1 to write labels and depths.
 _STEP, _MOST_OUTSIDE, _EXPORT = range(3)
 # Depth of a ray that meets nothing, far beyond any volume.
 FAR = 1e9
 
 
+class Rays(NamedTuple):
+    """A grid of rays through the pixels of V images."""
+
+    cameras: NDArray[np.floating]  # (V, 22) of :func:`tk.kernels.projection.pack_cameras`
+    step: int  # pixels between rays; the first goes through pixel ``step // 2``
+    directions: NDArray[np.float32]  # (V, H, W, 3) world frame; zero where a camera has no pixel
+
+
 class Cast(NamedTuple):
-    """The part that each ray meets first."""
+    """The part that each ray meets first; with B poses as the first axis."""
 
     label: NDArray[np.uint8]  # (V, H, W) uint8, 1 + the part's index; 0 where a ray meets nothing
     depth: NDArray[np.float32]  # (V, H, W) float32, in lengths of the ray's direction; `FAR` where a ray meets nothing
@@ -298,62 +305,75 @@ def nothing(shape: tuple[int, int, int]) -> Cast:
     return Cast(np.zeros(shape, np.uint8), np.full(shape, FAR, np.float32))
 
 
-def cast(
+def costs(
     body: ConeArrays,
-    cameras: NDArray[np.floating],
-    step: int,
-    rays: NDArray[np.float32],
+    rays: Rays,
     cost: NDArray[np.float32],
     poses: NDArray[np.floating],
     drawn: NDArray[np.int32] | None = None,
     before: Cast | None = None,
-    export: bool = False,
     most_outside: float = np.inf,
-) -> tuple[NDArray[np.float64], Cast | None]:
-    """Cast the rays at B poses and return their costs.
+) -> NDArray[np.float64]:
+    """Cast the rays at B poses and return the sums (B, V) of their costs.
 
     Args:
         body: the cone body.
-        cameras: (V, 22) rows of :func:`tk.kernels.projection.pack_cameras`.
-        step: pixels between rays; the first goes through pixel ``step // 2``.
-        rays: (V, H, W, 3) float32 viewing directions, world frame; zero where a camera has no pixel.
+        rays: the grid.
         cost: (V, H, W, G + 1) float32, see the module.
         poses: (B, D).
         drawn: (K,) indices of the parts to draw; all if None.
-        before: the cast of the other parts; nothing if None.
-        export: whether to return the casts.
+        before: the cast of the other parts at one pose; nothing if None.
         most_outside: a pose whose rays through the drawn parts' middles cost more than this, on average over parts and
             views, is not cast and costs inf: most candidate poses of a limb lie outside the visual hull, and these few
             rays reject them.
-
-    Returns:
-        (B, V) sum of the rays' costs; and, with ``export``, the casts with B as the first axis, else None.
     """
+    return _launch(body, rays, cost, poses, drawn, before or nothing(cost.shape[:3]), most_outside, None)
+
+
+def cast(
+    body: ConeArrays,
+    rays: Rays,
+    cost: NDArray[np.float32],
+    poses: NDArray[np.floating],
+    drawn: NDArray[np.int32] | None = None,
+    before: Cast | None = None,
+) -> tuple[NDArray[np.float64], Cast]:
+    """Return the sums of the rays' costs, and the casts; arguments as for :func:`costs`."""
+    before = before or nothing(cost.shape[:3])
+    B = len(poses)
+    met = Cast(np.repeat(before.label[None], B, axis=0), np.repeat(before.depth[None], B, axis=0))
+    return _launch(body, rays, cost, poses, drawn, before, np.inf, met), met
+
+
+def _launch(
+    body: ConeArrays,
+    rays: Rays,
+    cost: NDArray[np.float32],
+    poses: NDArray[np.floating],
+    drawn: NDArray[np.int32] | None,
+    before: Cast,
+    most_outside: float,
+    met: Cast | None,
+) -> NDArray[np.float64]:
+    """Return the sums of the rays' costs. ``met``, a copy of ``before`` for each pose, receives the casts."""
     ensure_runtime()
     dtype = body.tree.dtype
     poses = np.ascontiguousarray(poses, dtype)
     B, D = poses.shape
-    V, H, W = rays.shape[:3]
-    P = len(body.parts)
+    V, P = len(cost), len(body.parts)
     if drawn is None:
         drawn = np.arange(P, dtype=np.int32)
-    before = before or nothing((V, H, W))
     change = np.empty((B, V))
-    shape = (B, V, H, W) if export else (1, 1, 1, 1)
-    label, depth = np.empty(shape, np.uint8), np.empty(shape, np.float32)
-    if export:
-        label[:], depth[:] = before.label, before.depth
     _cast_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
         body.tree,
         body.parts,
         drawn,
         _above(body, drawn),
-        np.ascontiguousarray(cameras, dtype),
-        rays,
+        np.ascontiguousarray(rays.cameras, dtype),
+        rays.directions,
         cost,
-        before.label,
-        before.depth,
-        np.array((step, most_outside, export), dtype),
+        *before,
+        np.array((rays.step, most_outside, met is not None), dtype),
         spread_of(B),
         poses,
         np.empty((B, D, JOINT_NUMBERS), dtype),
@@ -361,8 +381,7 @@ def cast(
         np.empty((B, V, P, _COLUMNS), dtype),
         np.empty((B, len(drawn), 2), np.int32),
         change,
-        label,
-        depth,
+        *(met or (np.empty((1, 1, 1, 1), np.uint8), np.empty((1, 1, 1, 1), np.float32))),
     )
     if before.label.any():
         column = np.minimum(body.parts[:, PART_GROUP].astype(np.int32) + 1, cost.shape[3] - 1)
@@ -370,7 +389,7 @@ def cast(
         base = np.take_along_axis(cost, columns[..., None], axis=-1)[..., 0].sum(axis=(1, 2), dtype=np.float64)
     else:
         base = cost[..., 0].sum(axis=(1, 2), dtype=np.float64)
-    return base + change, Cast(label, depth) if export else None
+    return np.asarray(base + change)
 
 
 def _above(body: ConeArrays, drawn: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -108,7 +108,10 @@ class Launcher:
                 return
             for argument, value in zip(self._arguments, values, strict=True):
                 argument.put(self._context, value)
-            running.launch_kernel(self._compiled, self._context)
+            self._launch(running)
+
+    def _launch(self, running: Any) -> None:
+        running.launch_kernel(self._compiled, self._context)
 
     def _remember(self, values: tuple[Any, ...]) -> None:
         """Store the kernel that the last call compiled; nothing if this Taichi is an unknown version."""

@@ -256,8 +256,7 @@ def whole_delays(
     sampled = cache(lambda frame: grid.sample(masks(frame)).copy())
     bodies = []
     for i in rows:
-        _, met = Evidence.of(grid, masks(int(frames[i]))).cast(body, tracked.poses[i][None], export=True)
-        assert met is not None
+        _, met = Evidence.of(grid, masks(int(frames[i]))).cast(body, tracked.poses[i][None])
         bodies.append(met.label[0] > 0)
 
     def wrong(n: int, cameras: NDArray[np.intp]) -> Float:

@@ -29,7 +29,7 @@ from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import spread_out
 from tk.model.cameras.tracker_frame import TrackerFrame
 from tk.model.cues.part_colors import PartColors, RenderedBody, color_bins
-from tk.model.cues.ray_costs import Evidence, RayGrid, mean_of_views
+from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Pyramid, Views
 from tk.model.setup import Subject
 from tk.optim import gauss_newton
@@ -163,7 +163,7 @@ class ContourTracker:
         seen = self.views.pyramid(empty, 1, False)
         pose = np.zeros((1, len(body.skeleton.names)))
         normal_equations(body.arrays, self.views.at(seen, 0), pose, self.line_search)
-        Evidence.of(self.screen, empty).cast(body, pose)
+        Evidence.of(self.screen, empty).costs(body, pose)
 
     # --- initialisation (silhouette paper, section 4.6) ---------------------------------------------------------
 
@@ -401,7 +401,7 @@ class ContourTracker:
         """Return (B,) E_S, mean over the views that see anybody, inf if none does. A body on ``uncertain`` pixels
         counts half."""
         evidence = Evidence.of(self.screen, pyramid.masks[0], uncertain)
-        return mean_of_views(evidence.cast(self.body, poses)[0])
+        return evidence.costs(self.body, poses)
 
     def search(
         self,
@@ -427,28 +427,25 @@ class ContourTracker:
         """
         body, skeleton = self.body, self.body.skeleton
         rng = np.random.default_rng([7, frame.index])
-        by_view, met = evidence.cast(body, pose[None], export=True)
-        assert met is not None
-        own, surplus = mean_of_views(by_view)[0], evidence.surplus(met.label[0])
+        cost, met = evidence.cast(body, pose[None])
+        own, surplus = cost[0], evidence.surplus(met.label[0])
         joints = skeleton.joints(pose)
         level = (min(1, self.solver.scales - 1),)
         found: list[tuple[NDArray[np.int64], Float]] = []
         for limb in self.limbs:
             others = np.setdiff1d(np.arange(len(body.parts), dtype=np.int32), limb.parts)
-            without, rest = evidence.cast(body, pose[None], others, export=True)
-            assert rest is not None
-            if limb not in misplaced and mean_of_views(without)[0] - own > surplus:
+            without, rest = evidence.cast(body, pose[None], others)
+            if limb not in misplaced and without[0] - own > surplus:
                 continue  # the limb covers more than the surplus area that it could cover elsewhere
             before = Cast(rest.label[0].copy(), rest.depth[0].copy())
             tried = limb.candidates(pose, NEARBY, rng)
-            by_view, _ = evidence.cast(body, tried, limb.parts, before, most_outside=OUTSIDE)
-            cost = mean_of_views(by_view)
+            cost = evidence.costs(body, tried, limb.parts, before, most_outside=OUTSIDE)
             cost[cost > PROPOSED * own] = np.inf
             chosen = limb.distinct(tried, cost, MORE_CANDIDATES if limb in misplaced else CANDIDATES)
             if not len(chosen):
                 continue
             settled = self.settle(pyramid, chosen, level, images, limb=limb).states
-            cost = mean_of_views(evidence.cast(body, settled, limb.parts, before)[0])
+            cost = evidence.costs(body, settled, limb.parts, before)
             order = np.argsort(cost, kind="stable")
             settled, cost = settled[order], cost[order]
             better = settled[(cost < own + PROMISING) & (skeleton.apart(settled, joints) > SAME_POSE_M)][:2]
@@ -456,7 +453,7 @@ class ContourTracker:
                 found.append((limb.dofs, better))
         swaps = np.array([exchanged(pose, *pair) for pair in pairs(self.limbs)])
         swaps = self.settle(pyramid, swaps, (*level, 0), images).states
-        swaps = swaps[mean_of_views(evidence.cast(body, swaps)[0]) < own + PROMISING]
+        swaps = swaps[evidence.costs(body, swaps) < own + PROMISING]
         if not (len(swaps) or found):
             return pose[None], np.array([own])
         # exchanged arms and legs, the best poses of each limb, and combinations of two limbs
@@ -466,11 +463,11 @@ class ContourTracker:
                 both = better[0].copy()
                 both[dofs] = second[0][dofs]
                 poses.append(both)
-        cost = mean_of_views(evidence.cast(body, np.array(poses))[0])
+        cost = evidence.costs(body, np.array(poses))
         best = np.array(poses)[np.argsort(cost, kind="stable")[:FINISHED]]
         settled = np.concatenate([pose[None], self.settle(pyramid, best, (0,), images).states])
         fine = self.evidence(self.choice, frame, pyramid)
-        return settled, mean_of_views(fine.cast(body, settled)[0])
+        return settled, fine.costs(body, settled)
 
     def improved(self, frame: Observation, pyramid: Pyramid, pose: Float) -> Float:
         """Return the pose (D,), or the best one of a limb search if that costs :data:`GAIN` less."""

@@ -295,8 +295,7 @@ def stature_of(tracker: ContourTracker, pyramids: Sequence[Pyramid]) -> float:
             continue
         poses = gait.hypotheses(body.skeleton, 4, 0, p_centroid)  # standing, and the Da Vinci pose
         evidence = Evidence.of(tracker.screen, pyramid.masks[0])
-        met = evidence.cast(body, poses, export=True)[1]
-        assert met is not None
+        _, met = evidence.cast(body, poses)
         drawn = met.label > 0 if evidence.others is None else (met.label > 0) & ~evidence.others
         covered = np.count_nonzero(drawn, axis=(2, 3)).mean(axis=0)
         seen = np.count_nonzero(evidence.person, axis=(1, 2))

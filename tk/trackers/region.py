@@ -31,7 +31,7 @@ from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.bundle import CORRELATION_PX
 from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import color_bins
-from tk.model.cues.ray_costs import Evidence, mean_of_views
+from tk.model.cues.ray_costs import Evidence
 from tk.model.cues.visible_contours import contour_shares
 from tk.model.masks.mosaic import doubled
 from tk.model.masks.regions import SQUARE3
@@ -161,9 +161,7 @@ class RegionTracker(ContourTracker):
         poses, hessian, iterations = self.settle(pyramid, starts, levels, images, self.prior(starts), solver=solver)
         watch.lap("optimise")
         evidence = self.evidence(self.screen, frame, pyramid)
-        by_view, met = evidence.cast(self.body, poses, export=True)
-        assert met is not None
-        cost = mean_of_views(by_view)
+        cost, met = evidence.cast(self.body, poses)
         if not np.isfinite(cost).all():
             return self._nobody(frame, watch)
         self._alive = [
@@ -370,8 +368,7 @@ class RegionTracker(ContourTracker):
     def _look(self, evidence: Evidence, pyramid: Pyramid, images: NDArray[np.uint8] | None) -> _Look:
         """Return how the best pose explains the frame."""
         best = self._best.pose[None]
-        _, met = evidence.cast(self.body, best, export=True)
-        assert met is not None
+        _, met = evidence.cast(self.body, best)
         regions = None if images is None else self.colors.regions(images)
         here = normal_equations(self.body.arrays, self.views.at(pyramid, 0), best, self.line_search, regions)
         return _Look(met.label[0], here.hessian[0], evidence.residual(met.label[0]))

@@ -23,7 +23,7 @@ from tk.kernels.mask_values import OTHERS
 from tk.model.body.body_fit import STATURE_DEVIATION
 from tk.model.body.joint_sigma import directions, posture_variance
 from tk.model.body.skeleton import JOINTS, Skeleton
-from tk.model.cues.ray_costs import Evidence, mean_of_views, residual_of
+from tk.model.cues.ray_costs import Evidence, residual_of
 from tk.model.masks.silhouettes import Pyramid
 from tk.trackers.contour_tracker import GAIN, SAME_POSE_M
 from tk.trackers.hypotheses import MARGIN, RENEWAL, Hypothesis, disagreement
@@ -148,9 +148,8 @@ class SecondPass:
         parts that the grid's rays meet (B, V, h, w)."""
         tracker = self.tracker
         evidence = Evidence.of(tracker.screen, pyramid.masks[0])
-        by_view, met = evidence.cast(tracker.body, poses, export=True)
-        assert met is not None
-        return mean_of_views(by_view), np.array([evidence.residual(label) for label in met.label]), met.label
+        cost, met = evidence.cast(tracker.body, poses)
+        return cost, np.array([evidence.residual(label) for label in met.label]), met.label
 
     def _backwards(self, later: Hypothesis, poses: Float, cost: Float) -> Hypothesis | None:
         """Return the hypothesis from the next frame, tracked back by one, with its cost relative to this frame's pose;

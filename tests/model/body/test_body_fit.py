@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.model.figures import BODY as AVERAGE
-from tests.model.figures import scaled, surface_points
+from tests.model.figures import draw_silhouettes, scaled, surface_points
 from tests.model.ring import ring_of_cameras
 from tk.kernels.cones import CONE
 from tk.kernels.line_search import SearchSettings
@@ -19,7 +19,7 @@ from tk.model.body.cone_body import SHAPE_NUMBERS, build_cone_body
 from tk.model.body.gait_poses import walking_pose
 from tk.model.body.skeleton import SEGMENTS
 from tk.model.cues.ray_costs import Evidence, RayGrid
-from tk.model.masks.silhouettes import Views, draw_silhouettes
+from tk.model.masks.silhouettes import Views
 
 STATURE = 1.75
 VIEWS = Views(ring_of_cameras(3, width=240, height=300))
@@ -169,7 +169,7 @@ def test_shapes_are_recovered_as_mirror_images():
     grid = RayGrid(VIEWS.rig, 150)
 
     def error(body, poses):
-        return np.mean([Evidence.of(grid, p.masks[0]).cast(body, q[None])[0] for p, q in zip(seen, poses, strict=True)])
+        return np.mean([Evidence.of(grid, p.masks[0]).costs(body, q[None]) for p, q in zip(seen, poses, strict=True)])
 
     assert error(found, fitted) < 0.6 * error(AVERAGE, poses)
     parts = {part.name: part for part in found.parts}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.model.body.test_body_fit import edgels_all_over, walk
-from tests.model.figures import BODY, surface_points
+from tests.model.figures import BODY, draw_silhouettes, surface_points
 from tests.model.ring import ring_of_cameras
 from tk.errors import ConfigError
 from tk.io.captures.mask_store import MaskStore
@@ -29,7 +29,7 @@ from tk.model.cameras.refinement import (
     turn_between,
     world_motions,
 )
-from tk.model.masks.silhouettes import Views, draw_silhouettes
+from tk.model.masks.silhouettes import Views
 from tk.run.refinement import refine_rig
 
 RIG = ring_of_cameras(4, width=320, height=400)

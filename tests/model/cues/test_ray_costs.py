@@ -5,14 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.model.figures import BODY
+from tests.model.figures import BODY, draw_silhouettes
 from tests.model.ring import ring_of_cameras
+from tk.kernels.raycast import costs
 from tk.model.body.cone_body import COLOR_GROUPS
 from tk.model.body.gait_poses import walking_pose
 from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import PartColors
 from tk.model.cues.ray_costs import COLOR_COST, UNCERTAIN_COST, Evidence, RayGrid, mean_of_views
-from tk.model.masks.silhouettes import draw_silhouettes, share_wrong
+from tk.model.masks.silhouettes import share_wrong
 
 RIG = ring_of_cameras(3, width=120, height=160)
 FINE = RayGrid(RIG, 160)
@@ -25,8 +26,8 @@ DRAWN = draw_silhouettes(BODY, RIG, POSES)
 MASKS = DRAWN[0]
 
 
-def cast(evidence, poses=POSES, **options):
-    return evidence.cast(BODY, poses, **options)
+def by_view(evidence, poses=POSES):
+    return evidence.shares(costs(BODY.arrays, evidence.grid.packed, evidence.cost, poses))
 
 
 def test_grids_sample_the_middle_of_their_squares():
@@ -39,21 +40,22 @@ def test_grids_sample_the_middle_of_their_squares():
 
 
 def test_without_colors_the_cost_is_the_papers_error():
-    total, met = cast(Evidence.of(FINE, MASKS), export=True)
-    assert met is not None
+    evidence = Evidence.of(FINE, MASKS)
+    total, (mean, met) = by_view(evidence), evidence.cast(BODY, POSES)
     expected = np.array([share_wrong(drawn, MASKS) for drawn in DRAWN])
     np.testing.assert_allclose(total, expected, atol=1e-6)
     assert (total[1] > 0.1).all() and (total[0] < 1e-6).all()
-    residual = Evidence.of(FINE, MASKS).residual(met.label[1])
+    residual = evidence.residual(met.label[1])
     np.testing.assert_allclose(residual.sum(axis=1), expected[1], atol=1e-12)
     outside = (DRAWN[1] > 0) & (MASKS == 0)
     missing = np.count_nonzero(outside, axis=(1, 2)) / np.count_nonzero(MASKS, axis=(1, 2))
     np.testing.assert_allclose(residual[:, 0], missing, atol=1e-12)
-    np.testing.assert_allclose(mean_of_views(total), expected.mean(axis=1), atol=1e-6)
+    np.testing.assert_allclose(mean, expected.mean(axis=1), atol=1e-6)
+    np.testing.assert_array_equal(mean, evidence.costs(BODY, POSES))
 
 
 def test_coarse_grid_gives_nearly_the_same_cost():
-    coarse, _ = cast(Evidence.of(RayGrid(RIG, 54), MASKS))
+    coarse = by_view(Evidence.of(RayGrid(RIG, 54), MASKS))
     np.testing.assert_allclose(coarse[1], share_wrong(DRAWN[1], MASKS), rtol=0.2)
 
 
@@ -61,28 +63,26 @@ def test_view_without_a_person_does_not_count():
     masks = MASKS.copy()
     masks[1] = 0
     evidence = Evidence.of(FINE, masks)
-    total, met = cast(evidence, export=True)
+    total, (mean, met) = by_view(evidence), evidence.cast(BODY, POSES)
     assert np.isnan(total[:, 1]).all() and np.isfinite(total[:, [0, 2]]).all()
-    assert met is not None and np.isnan(evidence.residual(met.label[0])[:, 0]).tolist() == [False, True, False]
-    np.testing.assert_allclose(mean_of_views(total), total[:, [0, 2]].mean(axis=1))
-    nobody, _ = cast(Evidence.of(FINE, 0 * masks))
-    assert np.isnan(nobody).all() and np.isinf(mean_of_views(nobody)).all()
+    assert np.isnan(evidence.residual(met.label[0])[:, 0]).tolist() == [False, True, False]
+    np.testing.assert_allclose(mean, total[:, [0, 2]].mean(axis=1))
+    nobody = Evidence.of(FINE, 0 * masks)
+    assert np.isnan(by_view(nobody)).all() and np.isinf(nobody.costs(BODY, POSES)).all()
 
 
 def test_uncertain_pixels_halve_the_cost_outside_the_mask():
     """Where the mask may have missed the person, a part that covers it costs less; what it holds costs the same."""
-    whole, _ = cast(Evidence.of(FINE, MASKS))
-    doubted, _ = cast(Evidence.of(FINE, MASKS, MASKS == 0))
+    whole = by_view(Evidence.of(FINE, MASKS))
+    doubted = by_view(Evidence.of(FINE, MASKS, MASKS == 0))
     outside = ((DRAWN[1] > 0) & (MASKS == 0)).sum(axis=(1, 2)) / (MASKS > 0).sum(axis=(1, 2))
     np.testing.assert_allclose(whole[1] - doubted[1], (1 - UNCERTAIN_COST) * outside, atol=1e-6)
-    np.testing.assert_allclose(cast(Evidence.of(FINE, MASKS, MASKS == 255))[0], whole, atol=1e-6)
+    np.testing.assert_allclose(by_view(Evidence.of(FINE, MASKS, MASKS == 255)), whole, atol=1e-6)
 
 
 def test_color_of_another_part_costs():
     """A picture in the parts' own colours costs the pose nothing; with arms and trunk changed about it does."""
-    _, met = cast(Evidence.of(FINE, MASKS), POSES[:1], export=True)
-    assert met is not None
-    label = met.label[0]
+    label = FINE.render(BODY, POSES[:1]).label[0]
     palette = np.random.default_rng(3).permutation(15)[: len(COLOR_GROUPS)] * 17
     lookup = np.zeros((len(BODY.parts) + 1, 3), np.uint8)
     for p, g in enumerate(BODY.color_group, 1):
@@ -93,13 +93,13 @@ def test_color_of_another_part_costs():
     blind = Evidence.of(FINE, MASKS, None, images, colors)
     assert blind.bins is not None
     colors.learn(blind.bins[label > 0], label[label > 0])
-    right, _ = cast(Evidence.of(FINE, MASKS, None, images, colors), POSES[:1])
+    right = by_view(Evidence.of(FINE, MASKS, None, images, colors), POSES[:1])
     assert right.max() < 0.02
     arm, trunk = (GROUP_OF[name] for name in ("forearm_l", "chest"))
     swapped = label.copy()
     is_arm, is_trunk = (np.isin(label, np.flatnonzero(BODY.color_group == g) + 1) for g in (arm, trunk))
     swapped[is_arm], swapped[is_trunk] = NAMES.index("chest") + 1, NAMES.index("forearm_l") + 1
-    wrong, _ = cast(Evidence.of(FINE, MASKS, None, lookup[swapped], colors), POSES[:1])
+    wrong = by_view(Evidence.of(FINE, MASKS, None, lookup[swapped], colors), POSES[:1])
     share = (is_arm | is_trunk).sum(axis=(1, 2)) / (MASKS > 0).sum(axis=(1, 2))
     np.testing.assert_allclose(wrong[0], COLOR_COST * share, rtol=0.1)
     # no pictures, no colours
@@ -115,7 +115,7 @@ def test_images_of_different_sizes_are_handled():
     masks = MASKS.copy()
     masks[1, 100:], masks[1, :, 80:] = 0, 0
     drawn = draw_silhouettes(BODY, narrow, POSES)
-    total, _ = cast(Evidence.of(RayGrid(narrow, 160), masks))
+    total = by_view(Evidence.of(RayGrid(narrow, 160), masks))
     np.testing.assert_allclose(total, [share_wrong(d, masks) for d in drawn], atol=1e-6)
 
 

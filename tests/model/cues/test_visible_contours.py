@@ -22,7 +22,7 @@ def shares(left_arm: tuple[float, float, float]) -> np.ndarray:
         angles = shoulder_angles(np.array(direction) / np.linalg.norm(direction))
         pose[[skeleton.index(f"shoulder_{side}_{name}") for name in ("yaw", "pitch")]] = angles
     evidence = Evidence.of(GRID, np.full((4, *RIG.frame_shape), 255, np.uint8))
-    _, met = evidence.cast(BODY, pose[None], export=True)
+    _, met = evidence.cast(BODY, pose[None])
     assert met is not None
     return contour_shares(BODY, GRID, met.label[0], skeleton.joints(pose))
 

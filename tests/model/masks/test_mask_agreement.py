@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from scripts.synthetic.scene import look_at
+from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tk.kernels.mask_values import OTHERS
 from tk.model.body import gait_poses as gait
@@ -20,7 +21,6 @@ from tk.model.body.cone_body import build_cone_body
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume
 from tk.model.masks.mask_agreement import INCONSISTENT, Agreement, MaskAgreement, excess, largest_consistent
-from tk.model.masks.silhouettes import draw_silhouettes
 from tk.model.masks.tangency import Tangency
 
 

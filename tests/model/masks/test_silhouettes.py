@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
+from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.model.body.gait_poses import hip_and_knee, hypotheses, walking_pose
-from tk.model.masks.silhouettes import Views, clean, draw_silhouettes, pixel_rays, share_wrong
+from tk.model.cues.ray_costs import pixel_rays
+from tk.model.masks.silhouettes import Views, clean, share_wrong
 
 RIG = ring_of_cameras(2, width=101, height=133)
 BODY = build_cone_body(BodyDimensions.from_stature(1.7))

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from tk.kernels.mask_values import OTHERS
 from tk.kernels.projection import pack_cameras
-from tk.kernels.raycast import Cast, cast
+from tk.kernels.raycast import Cast, Rays, cast, costs
 from tk.model.body.cone_body import COLOR_GROUPS, ConeBody
 from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import PartColors, color_bins
-from tk.model.masks.silhouettes import pixel_rays
 
 Float = NDArray[np.float64]
 
@@ -35,6 +34,19 @@ UNCERTAIN_COST = 0.5
 LEAST_SEEN = 0.25
 
 
+def pixel_rays(rig: Rig, step: int = 1) -> NDArray[np.float32]:
+    """Return viewing directions (V, H, W, 3) of every ``step``-th pixel, world frame; zero outside smaller images."""
+    height, width = rig.frame_shape
+    offset = step // 2
+    ys, xs = np.arange(offset, height, step), np.arange(offset, width, step)
+    grid = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2).astype(np.float64)
+    rays = np.zeros((len(rig), len(ys) * len(xs), 3), np.float32)
+    for out, camera in zip(rays, rig, strict=True):
+        inside = (grid[:, 0] < camera.width) & (grid[:, 1] < camera.height)
+        out[inside] = camera.rays(grid[inside])
+    return rays.reshape(len(rig), len(ys), len(xs), 3)
+
+
 class RayGrid:
     """Every ``step``-th pixel of a rig's images.
 
@@ -47,7 +59,7 @@ class RayGrid:
         self.rig = rig
         self.step: int = max(1, round(rig.frame_shape[0] / rows))
         self.rays = pixel_rays(rig, self.step)
-        self.cameras = pack_cameras(rig).astype(np.float32)
+        self.packed = Rays(pack_cameras(rig).astype(np.float32), self.step, self.rays)
 
     def sample(self, images: NDArray) -> NDArray:
         """Return the grid's pixels (V, h, w, ...) of images (V, H, W, ...)."""
@@ -57,9 +69,7 @@ class RayGrid:
     def render(self, body: ConeBody, poses: Float) -> Cast:
         """Return the parts of the body that the rays meet at poses (B, D): labels and depths (B, V, h, w)."""
         free = np.zeros((*self.rays.shape[:3], 2), np.float32)
-        _, met = cast(body.arrays, self.cameras, self.step, self.rays, free, poses, export=True)
-        assert met is not None
-        return met
+        return cast(body.arrays, self.packed, free, poses)[1]
 
 
 @dataclass(frozen=True)
@@ -105,35 +115,30 @@ class Evidence:
             cost[person, 1:] = COLOR_COST * colors.mismatch[bins[person]]
         return Evidence(grid, person, cost, bins, others if shared else None)
 
-    def cast(
+    def costs(
         self,
         body: ConeBody,
         poses: Float,
         drawn: NDArray[np.int32] | None = None,
         before: Cast | None = None,
-        export: bool = False,
         most_outside: float = np.inf,
-    ) -> tuple[Float, Cast | None]:
-        """Return (B, V) the cost of poses (B, D) by view, NaN where a view sees nobody; with ``export`` also the parts
-        that the rays hit.
+    ) -> Float:
+        """Return (B,) the cost of poses (B, D), mean over the views that see anybody; inf if none does.
 
-        ``drawn``, ``before`` and ``most_outside`` as in :func:`tk.kernels.raycast.cast`.
+        ``drawn``, ``before`` and ``most_outside`` as in :func:`tk.kernels.raycast.costs`.
         """
-        grid = self.grid
-        total, met = cast(
-            body.arrays,
-            grid.cameras,
-            grid.step,
-            grid.rays,
-            self.cost,
-            poses,
-            drawn,
-            before,
-            export,
-            most_outside,
-        )
+        total = costs(body.arrays, self.grid.packed, self.cost, poses, drawn, before, most_outside)
+        return mean_of_views(self.shares(total))
+
+    def cast(self, body: ConeBody, poses: Float, drawn: NDArray[np.int32] | None = None) -> tuple[Float, Cast]:
+        """Return the cost (B,) as :meth:`costs`, and the parts that the rays meet."""
+        total, met = cast(body.arrays, self.grid.packed, self.cost, poses, drawn)
+        return mean_of_views(self.shares(total)), met
+
+    def shares(self, total: Float) -> Float:
+        """Return sums of costs (B, V) as shares of the person's rays; NaN where a view sees nobody."""
         seen = _areas(self.person, self.others)
-        return np.where(seen > 0, total / np.maximum(seen, 1), np.nan), met
+        return np.where(seen > 0, total / np.maximum(seen, 1), np.nan)
 
     def residual(self, label: NDArray[np.uint8]) -> Float:
         """Return (V, 2) missing and surplus area of a rendered body, labels (V, h, w), see :func:`residual_of`."""

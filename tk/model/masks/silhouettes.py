@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 
 from tk.kernels.mask_values import OTHERS
 from tk.kernels.projection import pack_cameras
-from tk.kernels.raycast import cast
 from tk.kernels.silhouette import Silhouettes
-from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.camera import Rig
 from tk.model.masks.regions import clean_by_area
 
@@ -125,43 +123,9 @@ def _marked(level: Masks, others: NDArray[np.bool_], step: int) -> Masks:
     return marked
 
 
-def pixel_rays(rig: Rig, step: int = 1) -> NDArray[np.float32]:
-    """Return viewing directions (V, H, W, 3) of every ``step``-th pixel, world frame; zero outside smaller images."""
-    height, width = rig.frame_shape
-    offset = step // 2
-    ys, xs = np.arange(offset, height, step), np.arange(offset, width, step)
-    grid = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2).astype(np.float64)
-    rays = np.zeros((len(rig), len(ys) * len(xs), 3), np.float32)
-    for out, camera in zip(rays, rig, strict=True):
-        inside = (grid[:, 0] < camera.width) & (grid[:, 1] < camera.height)
-        out[inside] = camera.rays(grid[inside])
-    return rays.reshape(len(rig), len(ys), len(xs), 3)
-
-
 def share_wrong(drawn: Masks, seen: Masks) -> Float:
     """Return E_S (V,) (eq. 12) of silhouettes (V, H, W) against masks (V, H, W), S_T; inf where the mask is empty."""
     wrong = np.count_nonzero((drawn >= 128) != (seen >= 128), axis=(1, 2))
     total = np.count_nonzero(seen >= 128, axis=(1, 2))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(total > 0, wrong / total, np.inf)
-
-
-class SilhouetteRenderer:
-    """Renders silhouettes of a body in the cameras of a rig."""
-
-    def __init__(self, body: ConeBody, rig: Rig) -> None:
-        self._arrays = body.arrays
-        self._rays, self._cameras = pixel_rays(rig), pack_cameras(rig).astype(np.float32)
-        self._cost = np.zeros((*self._rays.shape[:3], 2), np.float32)
-
-    def draw(self, pose: Float) -> NDArray[np.uint8]:
-        """Return the silhouettes (V, H, W) at a pose (D,), 0 or 255."""
-        _, met = cast(self._arrays, self._cameras, 1, self._rays, self._cost, pose[None], export=True)
-        assert met is not None
-        return np.where(met.label[0] > 0, np.uint8(255), np.uint8(0))
-
-
-def draw_silhouettes(body: ConeBody, rig: Rig, poses: Float) -> NDArray[np.uint8]:
-    """Render silhouettes (B, V, H, W) of the body at poses (B, D), 0 or 255."""
-    renderer = SilhouetteRenderer(body, rig)
-    return np.array([renderer.draw(pose) for pose in poses])  # depths of all pixels of many poses need much memory
