@@ -19,7 +19,7 @@ from tests.trackers.walker import BODY, STATURE, walk
 from tk.errors import CaptureError
 from tk.io import settings_file
 from tk.io.captures.frames import FrameSet
-from tk.io.results.data import Result, UsedCameras
+from tk.io.results.data import Result
 from tk.io.results.reader import read_result
 from tk.io.results.status import Status
 from tk.model.cameras.volume import Volume
@@ -27,7 +27,6 @@ from tk.model.setup import Setup, Subject
 from tk.run import offline
 from tk.run.choice import Choice
 from tk.run.people import Member, People
-from tk.run.plan import Plan
 from tk.run.session import estimates, track_source
 from tk.trackers.protocol import Observation
 
@@ -233,14 +232,14 @@ def test_a_run_stopped_between_two_people_s_second_passes_is_finished(
         track_source(PAIR, source, path, SETTINGS, Silent(), frames=span, people="all", resume=resume)
         return path
 
-    def stop_at_person_1(output: Path, plan: Plan, member: Member, *rest: Any) -> UsedCameras:
+    def stop_at_person_1(finisher: Any, member: Member, *rest: Any) -> None:
         if member.number == 1:
             raise KeyboardInterrupt
-        return finish_one(output, plan, member, *rest)
+        finish_one(finisher, member, *rest)
 
-    whole, finish_one = read_result(track("whole.h5")).people, offline._finish
+    whole, finish_one = read_result(track("whole.h5")).people, offline._Finisher.finish
     with monkeypatch.context() as patch:
-        patch.setattr(offline, "_finish", stop_at_person_1)
+        patch.setattr(offline._Finisher, "finish", stop_at_person_1)
         stopped = read_result(track("r.h5")).people
     assert stopped[0].smoothed is not None and stopped[1].smoothed is None
     for a, b in zip(read_result(track("r.h5", resume=True)).people, whole, strict=True):

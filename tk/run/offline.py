@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Container, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -56,10 +56,14 @@ def finish(
     within: Callable[[float], None],
     finished: Container[int] = (),
 ) -> None:
-    """Write what needs all frames, see :func:`_finish`, for the people who are not ``finished``, after people who were
-    mixed up are exchanged. Person 0 decides whether the cameras are refined. ``within`` receives the share of a long
-    stage that is done."""
-    cameras = UsedCameras(plan.setup.rig, np.array(plan.source.time_offset_s))
+    """Write what needs all frames, see :meth:`_Finisher.finish`, for the people who are not ``finished``, after people
+    who were mixed up are exchanged.
+
+    The second pass uses ``masks``; None: no second pass. ``within`` receives the share of a long stage that is done.
+    """
+    finisher = _Finisher(
+        output, plan, len(people) == 1, note, within, UsedCameras(plan.setup.rig, np.array(plan.source.time_offset_s))
+    )
     if finished:  # the first pass of a finished person is gone
         contacts = [replace(c, outcome=UNCLEAR) if c.outcome == EXCHANGED else c for c in contacts]
     found = read_result(output).people
@@ -70,120 +74,198 @@ def finish(
     for line in report(contacts):
         note(line)
     for member in people:
-        if member.number in finished:
-            stored = read_result(output).cameras or cameras
-            used = stored.rig.recorded().reduced(plan.setup.rig.reductions)
-            if not np.allclose(pack_cameras(used), pack_cameras(plan.setup.rig), rtol=_ROUNDED, atol=_ROUNDED):
-                cameras = replace(stored, rig=used)
+        number = member.number
+        if number in finished:
+            finisher.use_cameras_of_file()
             continue
-        store, result = None if masks is None else masks[member.number], results[member.number]
-        changed = [] if result is found[member.number] else list(COLUMNS)
-        alone = len(people) == 1
-        cameras = _finish(output, plan, member, result, changed, contacts, store, note, cameras, alone, within)
+        result = results[number]
+        draft = _Draft(result, ~result.has_pose, result.has_pose & doubtful(result, contacts))
+        if result is not found[number]:
+            draft.columns = {dataset: getattr(result, name) for dataset, name in COLUMNS.items()}
+        finisher.finish(member, draft, None if masks is None else masks[number])
 
 
-def _finish(
-    output: Path,
-    plan: Plan,
-    member: Member,
-    result: Result,
-    changed: Sequence[str],
-    contacts: Sequence[Contact],
-    masks: MaskStore | None,
-    note: Note,
-    cameras: UsedCameras,
-    alone: bool,
-    within: Callable[[float], None],
-) -> UsedCameras:
-    """Write what needs all frames of a person: the second pass; segments, feet and angles; the smoothed copy; cameras.
+@dataclass
+class _Draft:
+    """A person's result while it is finished.
 
-    The second pass uses ``masks``; None: no second pass. Its body is fitted to frames of the whole recording unless
-    that began with the initialisation pose, and its cameras are refined if they disagree and ``settings.refine`` is
-    True. The result is replaced in one step; if this function is interrupted, the result of the first pass stays.
-    ``changed`` are columns of the result that differ from the file. Returns the cameras that were used; persons after
-    the first take those that are given.
+    Attributes:
+        result: of the first pass.
+        lost: (F,) frames without a pose.
+        unclear: (F,) frames that are suspect, whatever their residual is.
+        columns: what differs from the file, by dataset.
     """
-    tracker, subject, fps = member.tracker, member.subject, plan.setup.fps
-    if not tracker.has_segments:
-        return cameras
-    poses = result.pose.copy()
-    lost = ~result.has_pose
-    unclear = ~lost & doubtful(result, contacts)
-    columns: dict[str, NDArray[Any]] = {name: getattr(result, COLUMNS[name]) for name in changed}
-    model: Mapping[str, Value] | None = None
-    again = two_pass(tracker)
-    missing = [] if masks is None else [int(f) for f in result.frames if int(f) not in masks]
-    if again is not None and missing and not alone:
-        note(f"person {member.number}: the second pass is omitted, because an earlier run kept no masks of each person")
-    elif again is not None and masks is not None:
-        assert result.residual is not None
-        if missing:  # frames that an earlier run has tracked
+
+    result: Result
+    lost: NDArray[np.bool_]
+    unclear: NDArray[np.bool_]
+    columns: dict[str, NDArray[Any]] = field(default_factory=dict)
+
+    def current(self, dataset: str) -> Any:
+        """Return one of :data:`~tk.run.identity.COLUMNS` as it is now; None if the result has none."""
+        return self.columns.get(dataset, getattr(self.result, COLUMNS[dataset]))
+
+    def replace(self, rows: NDArray[np.int64], estimates: Sequence[Estimate]) -> None:
+        """Take other estimates for some frames; the first frame's status stays "initialised"."""
+        datasets = ("pose", "joints/sigma", "residual", "objective", "status")
+        columns = {dataset: self.current(dataset).copy() for dataset in datasets}
+        for row, e in zip(rows, estimates, strict=True):
+            columns["pose"][row], columns["objective"][row] = e.pose, e.objective
+            columns["joints/sigma"][row], columns["residual"][row] = e.sigma, e.residual
+            if columns["status"][row] != Status.INITIALISED:
+                columns["status"][row] = Status[e.status.upper()]
+            self.lost[row] = e.status == "lost"
+        self.columns |= columns
+
+
+@dataclass
+class _Finisher:
+    """Finishes people one after the other. Person 0 decides whether the cameras are refined."""
+
+    output: Path
+    plan: Plan
+    alone: bool  # whether the result has one person
+    note: Note
+    within: Callable[[float], None]
+    cameras: UsedCameras
+
+    def use_cameras_of_file(self) -> None:
+        """Use the cameras of a person who was finished by an earlier run, if they are other ones."""
+        rig, stored = self.plan.setup.rig, read_result(self.output).cameras or self.cameras
+        used = stored.rig.recorded().reduced(rig.reductions)
+        if not np.allclose(pack_cameras(used), pack_cameras(rig), rtol=_ROUNDED, atol=_ROUNDED):
+            self.cameras = replace(stored, rig=used)
+
+    def finish(self, member: Member, draft: _Draft, masks: MaskStore | None) -> None:
+        """Write what needs all frames of a person: the second pass; segments, feet and angles; the smoothed copy;
+        cameras. The result is replaced in one step: if this is interrupted, the result of the first pass stays."""
+        tracker, setup = member.tracker, self.plan.setup
+        if not tracker.has_segments:
+            return
+        model: Mapping[str, Value] | None = None
+        again = two_pass(tracker)
+        if again is not None and masks is not None and self._complete(masks, member.number, again, draft.result):
+            tracker = self._second_pass(member, again, masks, draft)
+            model = {**tracker.model(), REFINED: 1}
+        if draft.current("joints/sigma") is not None and draft.current("residual") is not None:
+            self._judge(draft, model is not None)
+        _LOG.info("angles, feet, and the smoothed copy")
+        body, poses = tracker.body.standing(setup.up), draft.current("pose")
+        # poses of the first pass stay as they are
+        kept = () if "pose" in draft.columns else ("pose", "joints/position")
+        columns = draft.columns | {name: v for name, v in _columns(body, poses).items() if name not in kept}
+        filtered = smooth(body.skeleton, poses, ~draft.lost, setup.fps)
+        smoothed = {**_columns(body, filtered.poses), "bridged": filtered.bridged}
+        cameras = self.cameras.recorded()
+        revise_result(self.output, columns, smoothed=smoothed, model=model, cameras=cameras, person=member.number)
+
+    def _complete(self, masks: MaskStore, person: int, tracker: TwoPassTracker, result: Result) -> bool:
+        """Return whether a person's masks of all frames are known. Those that an earlier run has used are made again if
+        nobody else is tracked."""
+        missing = [int(f) for f in result.frames if int(f) not in masks]
+        if missing and not self.alone:
+            self.note(
+                f"person {person}: the second pass is omitted, because an earlier run kept no masks of each person"
+            )
+            return False
+        if missing:
+            plan = self.plan
             with open_observations(plan.setup, plan.source, plan.settings, lambda _: None) as observations:
                 for observation, _ in observations.frames(min(missing), max(missing) + 1):
-                    masks.put(observation.index, again.cleaned(again.without_foreign(observation).masks))
-        _LOG.info("second pass: comparing the cameras")
-        tracked = TrackedPoses(result.frames, poses.copy(), ~lost)
-        agreement = compare_cameras(again, masks, tracked)
-        if apart := "" if agreement is None else agreement.contradiction:
-            note(f"{apart}: all frames are suspect")
-            unclear = ~lost
-        if member.number:
-            late = np.round((cameras.time_offset_s - plan.source.time_offset_s) * fps).astype(np.int64)
-            again, masks = again.with_cameras(cameras.rig), retimed(masks, result.frames, late)
-        elif agreement is not None and plan.settings.refine and not apart:
-            refined = refine_if_inconsistent(again, agreement, masks, tracked, note)
-            if refined is not None:
-                again, masks, offsets = refined
-                cameras = UsedCameras(again.rig, cameras.time_offset_s + offsets / fps)
-                if np.round(offsets).any() and alone:
-                    note("tracking again: the images of the first pass were not synchronised")
-                    present = result.status != Status.ABSENT
-                    found = _track_again(plan, again, cameras, masks, result.frames[present], poses[present], within)
-                    rows = np.flatnonzero(present & np.isin(result.frames, list(found)))
-                    estimates = [found[int(frame)] for frame in result.frames[rows]]
-                    poses[rows] = [e.pose for e in estimates]
-                    lost[rows] = [e.status == "lost" for e in estimates]
-                    columns |= _replaced(result, rows, estimates)
+                    masks.put(observation.index, tracker.cleaned(tracker.without_foreign(observation).masks))
+        return True
+
+    def _second_pass(self, member: Member, tracker: TwoPassTracker, masks: MaskStore, draft: _Draft) -> TwoPassTracker:
+        """Optimise the poses of a draft by what all frames show. Return the tracker with the final cameras and body.
+
+        The body is fitted to frames of the whole recording unless that began with the initialisation pose.
+        """
+        subject = member.subject
+        tracker, masks = self._with_final_cameras(member.number, tracker, masks, draft)
         _LOG.info("second pass")
-        assert result.sigma is not None
-        before = columns.get("joints/sigma", result.sigma)
-        poses, columns["residual"], precise = again.second_pass(
-            masks.sequence(result.frames),
-            poses,
-            lost,
-            columns.get("residual", result.residual),
+        poses, residual, precise = tracker.second_pass(
+            masks.sequence(draft.result.frames),
+            draft.current("pose"),
+            draft.lost,
+            draft.current("residual"),
             subject.height_m,
             # in the initialisation pose every limb is visible; other first poses may hide limbs, and so may others
-            keep_body=subject.body is not None or (alone and subject.init is None and subject.in_init_pose),
-            report=within,
+            keep_body=subject.body is not None or (self.alone and subject.init is None and subject.in_init_pose),
+            report=self.within,
         )
         # a much larger sigma of the first pass, or NaN: it tracked several poses, or did not find a limb
-        columns["joints/sigma"] = np.where(before <= _LESS_SURE * precise, precise, before)
-        tracker = again
-        model = {**tracker.model(), REFINED: 1}
-    sigma, residual = columns.get("joints/sigma", result.sigma), columns.get("residual", result.residual)
-    if sigma is not None and residual is not None:
-        suspect = ~lost
-        suspect[suspect] = contradicted(residual[suspect], plan.settings.region.false_alarm)
-        unclear &= ~lost  # tracking again may have lost frames
-        unknown = ~lost & np.isnan(sigma).all(axis=1)
-        if model is not None:  # without a second pass, no frame depends on later ones
-            unknown = ~lost & high_residual(unknown)
-        status = columns.get("status", result.status)
+        before = draft.current("joints/sigma")
+        sigma = np.where(before <= _LESS_SURE * precise, precise, before)
+        draft.columns |= {"pose": poses, "residual": residual, "joints/sigma": sigma}
+        return tracker
+
+    def _with_final_cameras(
+        self, person: int, tracker: TwoPassTracker, masks: MaskStore, draft: _Draft
+    ) -> tuple[TwoPassTracker, MaskStore]:
+        """Return the tracker with refined cameras, and synchronised masks, if the cameras disagree about person 0 and
+        ``settings.refine`` is True, else both as they are. Other people take over what person 0 has decided."""
+        plan, result = self.plan, draft.result
+        _LOG.info("second pass: comparing the cameras")
+        tracked = TrackedPoses(result.frames, result.pose, result.has_pose)
+        agreement = compare_cameras(tracker, masks, tracked)
+        if apart := "" if agreement is None else agreement.contradiction:
+            self.note(f"{apart}: all frames are suspect")
+            draft.unclear = ~draft.lost
+        if person:
+            late = np.round((self.cameras.time_offset_s - plan.source.time_offset_s) * plan.setup.fps).astype(np.int64)
+            return tracker.with_cameras(self.cameras.rig), retimed(masks, result.frames, late)
+        if agreement is None or apart or not plan.settings.refine:
+            return tracker, masks
+        refined = refine_if_inconsistent(tracker, agreement, masks, tracked, self.note)
+        if refined is None:
+            return tracker, masks
+        tracker, masks, offsets = refined
+        self.cameras = UsedCameras(tracker.rig, self.cameras.time_offset_s + offsets / plan.setup.fps)
+        if np.round(offsets).any() and self.alone:
+            self.note("tracking again: the images of the first pass were not synchronised")
+            self._track_again(tracker, masks, draft)
+        return tracker, masks
+
+    def _track_again(self, tracker: TwoPassTracker, masks: MaskStore, draft: _Draft) -> None:
+        """Track the frames again of which every synchronised camera has an image, beginning at the first pass's pose;
+        none if the source cannot be read again. ``masks``: synchronised; they are not made again."""
+        result, source = draft.result, self.plan.source.shifted(self.cameras.time_offset_s.tolist())
+        if source is None or source.frame_count is None:
+            return
+        present = np.flatnonzero(result.status != Status.ABSENT)
+        frames = result.frames[present]
+        begin = max(source.first_frame, int(frames[0]))
+        stop = min(source.frame_count, int(frames[-1]) + 1)
+        if begin >= stop:
+            return
+        tracker.start_at(result.pose[present][np.searchsorted(frames, begin)])
+        found = {}
+        with source.frames(begin, stop) as images:
+            for frame in images:
+                if frame.index in masks:
+                    observation = Observation(frame.index, frame.images, masks.get(frame.index), time=frame.time)
+                    found[frame.index] = replace(tracker.step(observation), masks=None, drawn=None)  # these are large
+                self.within((frame.index + 1 - begin) / (stop - begin))
+        again = np.isin(frames, list(found))
+        draft.replace(present[again], [found[int(frame)] for frame in frames[again]])
+
+    def _judge(self, draft: _Draft, second_pass: bool) -> None:
+        """Mark frames as suspect whose residual contradicts the pose; their sigma is unknown, as it is where the
+        residual is high."""
+        sigma, tracked = draft.current("joints/sigma"), ~draft.lost
+        suspect = tracked.copy()
+        suspect[suspect] = contradicted(draft.current("residual")[suspect], self.plan.settings.region.false_alarm)
+        unclear = draft.unclear & tracked  # tracking again may have lost frames
+        unknown = tracked & np.isnan(sigma).all(axis=1)
+        if second_pass:  # without one, no frame depends on later ones
+            unknown = tracked & high_residual(unknown)
+        status = draft.current("status")
         status = np.where(status == Status.SUSPECT, np.uint8(Status.TRACKED), status)
-        columns["status"] = np.where(suspect | unclear, np.uint8(Status.SUSPECT), status)
-        columns["joints/sigma"] = np.where((suspect | unclear | unknown)[:, None], np.nan, sigma)
-        report_unknown(result.frames[unknown & ~suspect & ~unclear], note)
-        report_suspect(result.frames[suspect], note)
-    _LOG.info("angles, feet, and the smoothed copy")
-    # poses of the first pass stay as they are
-    kept = ("pose", "joints/position") if model is None and not changed else ()
-    body = tracker.body.standing(plan.setup.up)
-    columns |= {name: values for name, values in _columns(body, poses).items() if name not in kept}
-    filtered = smooth(body.skeleton, poses, ~lost, fps)
-    smoothed = {**_columns(body, filtered.poses), "bridged": filtered.bridged}
-    revise_result(output, columns, smoothed=smoothed, model=model, cameras=cameras.recorded(), person=member.number)
-    return cameras
+        draft.columns["status"] = np.where(suspect | unclear, np.uint8(Status.SUSPECT), status)
+        draft.columns["joints/sigma"] = np.where((suspect | unclear | unknown)[:, None], np.nan, sigma)
+        frames = draft.result.frames
+        report_unknown(frames[unknown & ~suspect & ~unclear], self.note)
+        report_suspect(frames[suspect], self.note)
 
 
 def high_residual(unknown: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -207,55 +289,6 @@ def report_suspect(frames: Sequence[int] | NDArray[np.int64], note: Callable[[st
             f"body and masks differ more than in correct recordings: suspect, {which}; likely causes: the calibration "
             "of another recording, moved cameras, or videos of different recordings (see tk inspect)"
         )
-
-
-def _track_again(
-    plan: Plan,
-    tracker: TwoPassTracker,
-    cameras: UsedCameras,
-    masks: MaskStore,
-    frames: NDArray[np.int64],
-    poses: Float,
-    within: Callable[[float], None],
-) -> dict[int, Estimate]:
-    """Return estimates, by frame, of the frames (F,) of which every synchronised camera has an image; none if the
-    source cannot be read again.
-
-    Tracking begins at the first pass's pose. ``masks``: the synchronised masks, which are not made again.
-    """
-    source = plan.source.shifted(cameras.time_offset_s.tolist())
-    if source is None or source.frame_count is None:
-        return {}
-    begin = max(source.first_frame, int(frames[0]))
-    stop = min(source.frame_count, int(frames[-1]) + 1)
-    if begin >= stop:
-        return {}
-    tracker.start_at(poses[np.searchsorted(frames, begin)])
-    found = {}
-    with source.frames(begin, stop) as images:
-        for frame in images:
-            if frame.index in masks:
-                observation = Observation(frame.index, frame.images, masks.get(frame.index), time=frame.time)
-                found[frame.index] = replace(tracker.step(observation), masks=None, drawn=None)  # these are large
-            within((frame.index + 1 - begin) / (stop - begin))
-    return found
-
-
-def _replaced(result: Result, rows: NDArray[np.int64], estimates: Sequence[Estimate]) -> dict[str, NDArray[Any]]:
-    """Return the columns of a result with these rows replaced by other estimates."""
-    assert result.sigma is not None and result.residual is not None
-    columns = {
-        "joints/sigma": result.sigma.copy(),
-        "residual": result.residual.copy(),
-        "objective": result.objective.copy(),
-        "status": result.status.copy(),
-    }
-    for row, e in zip(rows, estimates, strict=True):
-        columns["joints/sigma"][row], columns["residual"][row] = e.sigma, e.residual
-        columns["objective"][row] = e.objective
-        if result.status[row] != Status.INITIALISED:
-            columns["status"][row] = Status[e.status.upper()]
-    return columns
 
 
 def _columns(body: ConeBody, poses: NDArray[np.float64]) -> dict[str, NDArray[np.floating]]:
