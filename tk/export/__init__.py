@@ -83,14 +83,7 @@ def export(
         ResultError: the result cannot be read, or has nothing to export.
         ExportError: a format is unknown, a file exists, or none of the formats can be written.
     """
-    formats = tuple(FORMATS) if "all" in formats else tuple(dict.fromkeys(formats))
-    if not formats or not {*formats} <= {*FORMATS}:
-        raise ExportError(f"formats {', '.join(formats)}: give some of {', '.join(FORMATS)}, or all")
-    if bvh_units not in BVH_UNITS:
-        raise ExportError(f"BVH unit {bvh_units}: give one of {', '.join(BVH_UNITS)}")
-    chosen = {name: FORMATS[name] for name in formats}
-    if "bvh" in chosen:
-        chosen["bvh"] = replace(chosen["bvh"], outputs=((".bvh", partial(write_bvh, units=bvh_units)),))
+    chosen = _chosen(formats, bvh_units)
     failed = {
         name: f"needs the package {form.package}: pip install 'tk-mocap[export]'"
         for name, form in chosen.items()
@@ -107,15 +100,48 @@ def export(
         for ending, write in form.outputs
     ]
     for _, name, target, _ in jobs:
-        begins = FORMATS[name].begins
-        if begins is not None and target.parent.is_dir():
-            kind = Kind(f"a file of tk export in {target.suffix}", (target.suffix,), looks_like(begins))
-            check_output(target, kind, force, [path])
-        elif check_not_input(target, [path]).exists() and not force:
-            raise ExportError(f"{target}: exists; choose another folder", hint="or replace it with --force")
+        _check_target(target, FORMATS[name], path, force)
+    motions, notes = _motions(people, smoothed, ", ".join(name for name, form in chosen.items() if form.holds))
+    written, refused = list[Path](), list[TkError]()
+    for person, name, target, write in jobs:
+        if name not in failed and person.person in motions:
+            try:
+                _write(motions[person.person], target, write)
+                written.append(target)
+            except TkError as error:
+                failed[name] = str(error)
+                refused.append(error)
+    reasons = tuple(f"{name}: {reason}" for name, reason in failed.items())
+    if not written:
+        raise (type(refused[0]) if refused else ExportError)("; ".join(dict.fromkeys(reasons or notes)))
+    return Exported(tuple(written), tuple(notes), reasons)
+
+
+def _chosen(formats: Sequence[str], bvh_units: str) -> dict[str, Format]:
+    """Return the formats with these names."""
+    names = tuple(FORMATS) if "all" in formats else tuple(dict.fromkeys(formats))
+    if not names or not {*names} <= {*FORMATS}:
+        raise ExportError(f"formats {', '.join(names)}: give some of {', '.join(FORMATS)}, or all")
+    if bvh_units not in BVH_UNITS:
+        raise ExportError(f"BVH unit {bvh_units}: give one of {', '.join(BVH_UNITS)}")
+    bvh = replace(FORMATS["bvh"], outputs=((".bvh", partial(write_bvh, units=bvh_units)),))
+    return {name: bvh if name == "bvh" else FORMATS[name] for name in names}
+
+
+def _check_target(target: Path, form: Format, result: Path, force: bool) -> None:
+    """Refuse a target that exists, unless it is of the format and ``force``; and the result itself."""
+    if form.begins is not None and target.parent.is_dir():
+        kind = Kind(f"a file of tk export in {target.suffix}", (target.suffix,), looks_like(form.begins))
+        check_output(target, kind, force, [result])
+    elif check_not_input(target, [result]).exists() and not force:
+        raise ExportError(f"{target}: exists; choose another folder", hint="or replace it with --force")
+
+
+def _motions(people: Sequence[Result], smoothed: bool, holding: str) -> tuple[dict[int, Motion], list[str]]:
+    """Return the motion of each person who has one, and notes. ``holding``: the formats that hold a pose if frames are
+    lost."""
     motions: dict[int, Motion] = {}
     notes: list[str] = []
-    holding = ", ".join(name for name, form in chosen.items() if form.holds)
     for person in people:
         whose = f"person {person.person}: " if len(people) > 1 else ""
         try:
@@ -130,19 +156,7 @@ def export(
         lost = int((~motion.known).sum())
         if lost and holding:
             notes.append(f"{whose}{holding}: in {lost} lost frames the pose before is held")
-    written, refused = list[Path](), list[TkError]()
-    for person, name, target, write in jobs:
-        if name not in failed and person.person in motions:
-            try:
-                _write(motions[person.person], target, write)
-                written.append(target)
-            except TkError as error:
-                failed[name] = str(error)
-                refused.append(error)
-    reasons = tuple(f"{name}: {reason}" for name, reason in failed.items())
-    if not written:
-        raise (type(refused[0]) if refused else ExportError)("; ".join(dict.fromkeys(reasons or notes)))
-    return Exported(tuple(written), tuple(notes), reasons)
+    return motions, notes
 
 
 def _number(person: Result, people: Sequence[Result]) -> str:
