@@ -24,6 +24,7 @@ from scripts.paper.sampling import diagonal_basis
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.results.reader import read_joints
 from tk.model.cues.objective import BARRED
+from tk.model.setup import Subject
 from tk.run.segmentation import make_labeller
 from tk.settings import Settings
 from tk.trackers.protocol import Observation
@@ -64,7 +65,7 @@ class Recorded:
     def error(self, config: Settings) -> tuple[NDArray[np.float64], int]:
         """Track with these settings; return the joint errors (F, 15), metres, and the number of lost frames."""
         tracker = VolumetricTracker(self.capture.rig, self.capture.volume, self.capture.up, config)
-        tracker.start(self.frames[: tracker.opening_frames], self.capture.subject_height_m, None)
+        tracker.start(self.frames[: tracker.opening_frames], Subject(self.capture.subject_height_m))
         found = [tracker.step(frame) for frame in self.frames]
         distance = np.linalg.norm(np.array([estimate.joints for estimate in found]) - self.truth, axis=2)
         return distance, sum(estimate.status == "lost" for estimate in found)

@@ -22,6 +22,7 @@ import numpy as np
 
 from scripts.ablation import Recorded
 from tk.model.body.limb_candidates import Limb
+from tk.model.setup import Subject
 from tk.trackers.protocol import Observation
 from tk.trackers.region import RegionTracker
 
@@ -87,7 +88,7 @@ def recall(recorded: Recorded, every: int) -> list[Trial]:
     """Return the trials of a capture, in every ``every``-th frame."""
     capture = recorded.capture
     tracker = Trials(capture.rig, capture.up)
-    tracker.start(recorded.frames[: tracker.opening_frames], capture.subject_height_m, None)
+    tracker.start(recorded.frames[: tracker.opening_frames], Subject(capture.subject_height_m))
     done = []
     for frame in recorded.frames:
         tracked = tracker.step(frame).status == "tracked"

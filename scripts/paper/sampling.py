@@ -20,6 +20,7 @@ from tk.io.captures.capture import open_capture
 from tk.kernels.nearest import SurfaceIndex
 from tk.model.cues.edge_term import ContourTerm
 from tk.model.cues.objective import CHAIN_NAMES, BodyObjective, FrameObjective
+from tk.model.setup import Subject
 from tk.optim import schedule as s
 from tk.optim import smd
 from tk.run.segmentation import make_segmenter
@@ -67,7 +68,7 @@ def look(options: Options, paper: Settings) -> Scene:
     with capture.frames(0, options.frames) as frames:
         seen = (Observation(f.index, f.images.copy(), segment(f).copy()) for f in frames)
         first = list(islice(seen, opening))
-        tracker.start(first, capture.subject_height_m, None)
+        tracker.start(first, Subject(capture.subject_height_m))
         for observation in (*first, *seen):
             estimate = tracker.step(observation)
     surface = estimate.surface
