@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError
 from tk.kernels.line_search import SearchSettings
-from tk.kernels.raycast import Cast
 from tk.kernels.silhouette import descend, normal_equations
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_fit import INFORMATIVE_FRAMES, STATURE_DEVIATION, fit_body
 from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.initial_pose import rough_pose
-from tk.model.body.limb_candidates import Limb, exchanged, limbs_of, pairs
+from tk.model.body.limb_candidates import Limb, limbs_of
 from tk.model.body.skeleton import build_skeleton, convert_poses
 from tk.model.body.stored_body import body_values, restore_body
 from tk.model.cameras.camera import Rig
@@ -36,6 +35,7 @@ from tk.optim import gauss_newton
 from tk.optim.gauss_newton import BatchSolution, GaussNewtonSettings, Prior
 from tk.settings import SilhouetteSettings
 from tk.trackers.initialisation import HEADINGS, PHASES, TrajectoryHypothesis, centroid, find_person, stature_of
+from tk.trackers.limb_search import LimbSearch
 from tk.trackers.protocol import Observation
 
 Float = NDArray[np.float64]
@@ -54,21 +54,6 @@ MOST_STATURE_RATIO = 1.35
 # Decrease of the cost, as a share of the person's pixels, at which another pose of a limb replaces the current one.
 # Between half and twice the value, the mean errors of dance and cube (60 frames) change by 0.01 cm at most.
 GAIN = 0.004
-# Candidates of a limb that are refined; of a limb that is known to be misplaced; random candidates near its pose that
-# are screened beside the grid. With 3 and 8 refined candidates half as many more of the misplaced limbs stay misplaced
-# (scripts/search_recall.py).
-CANDIDATES, MORE_CANDIDATES, NEARBY = 8, 16, 80
-# Screening stops at a candidate of which this share lies outside the silhouettes. With 0.2 and 0.8 the mean errors
-# of dance and cube (60 frames) change by less than 0.05 cm.
-OUTSIDE = 0.4
-# A candidate is not refined if the whole body's cost exceeds the current one by this factor; after the limb alone has
-# converged, it is dropped if it costs this share of the person's pixels more. Mean errors of dance and cube (60
-# frames): 0.15 cm more with a factor of 0.75, unchanged with 3; unchanged with half and twice the share.
-PROPOSED, PROMISING = 1.5, 0.01
-# Poses that a search refines with all limbs, beside the current one.
-FINISHED = 2
-# Poses that differ by more than this, mean over the joints, metres, are different.
-SAME_POSE_M = 0.05
 # A recovered person who faces the other way than before must have a residual (E_S) lower by this at a half turn.
 # Half and twice the value change nothing in dance and cube (60 frames), where nobody is lost for long.
 FACING = 0.04
@@ -412,9 +397,7 @@ class ContourTracker:
         images: NDArray[np.uint8] | None = None,
         misplaced: Sequence[Limb] = (),
     ) -> tuple[Float, Float]:
-        """Search for better poses of the limbs: screen all candidates of a limb in one launch, refine the best ones by
-        the limb alone, then the most promising by the whole body. Exchanged arms and legs are candidates, too: where
-        each has taken the other's place, neither finds its own as long as the other stays.
+        """Search for better poses of the limbs, see :mod:`tk.trackers.limb_search`, and settle the best of them.
 
         Args:
             frame, pyramid, evidence: the frame, its silhouettes, its costs on the grid :attr:`screen`.
@@ -425,49 +408,17 @@ class ContourTracker:
         Returns:
             Poses (B, D), the current one first, and their costs (B,).
         """
-        body, skeleton = self.body, self.body.skeleton
+
+        def settle(poses: Float, levels: Sequence[int], limb: Limb | None = None) -> Float:
+            return self.settle(pyramid, poses, levels, images, limb=limb).states
+
+        search = LimbSearch(self.body, self.limbs, evidence, settle, pose)
         rng = np.random.default_rng([7, frame.index])
-        cost, met = evidence.cast(body, pose[None])
-        own, surplus = cost[0], evidence.surplus(met.label[0])
-        joints = skeleton.joints(pose)
-        level = (min(1, self.solver.scales - 1),)
-        found: list[tuple[NDArray[np.int64], Float]] = []
-        for limb in self.limbs:
-            others = np.setdiff1d(np.arange(len(body.parts), dtype=np.int32), limb.parts)
-            without, rest = evidence.cast(body, pose[None], others)
-            if limb not in misplaced and without[0] - own > surplus:
-                continue  # the limb covers more than the surplus area that it could cover elsewhere
-            before = Cast(rest.label[0].copy(), rest.depth[0].copy())
-            tried = limb.candidates(pose, NEARBY, rng)
-            cost = evidence.costs(body, tried, limb.parts, before, most_outside=OUTSIDE)
-            cost[cost > PROPOSED * own] = np.inf
-            chosen = limb.distinct(tried, cost, MORE_CANDIDATES if limb in misplaced else CANDIDATES)
-            if not len(chosen):
-                continue
-            settled = self.settle(pyramid, chosen, level, images, limb=limb).states
-            cost = evidence.costs(body, settled, limb.parts, before)
-            order = np.argsort(cost, kind="stable")
-            settled, cost = settled[order], cost[order]
-            better = settled[(cost < own + PROMISING) & (skeleton.apart(settled, joints) > SAME_POSE_M)][:2]
-            if len(better):
-                found.append((limb.dofs, better))
-        swaps = np.array([exchanged(pose, *pair) for pair in pairs(self.limbs)])
-        swaps = self.settle(pyramid, swaps, (*level, 0), images).states
-        swaps = swaps[evidence.costs(body, swaps) < own + PROMISING]
-        if not (len(swaps) or found):
-            return pose[None], np.array([own])
-        # exchanged arms and legs, the best poses of each limb, and combinations of two limbs
-        poses = [*swaps, *(one for _, better in found for one in better)]
-        for i, (_, better) in enumerate(found):
-            for dofs, second in found[i + 1 :]:
-                both = better[0].copy()
-                both[dofs] = second[0][dofs]
-                poses.append(both)
-        cost = evidence.costs(body, np.array(poses))
-        best = np.array(poses)[np.argsort(cost, kind="stable")[:FINISHED]]
-        settled = np.concatenate([pose[None], self.settle(pyramid, best, (0,), images).states])
-        fine = self.evidence(self.choice, frame, pyramid)
-        return settled, fine.costs(body, settled)
+        best = search.better(min(1, self.solver.scales - 1), misplaced, rng)
+        if not len(best):
+            return pose[None], np.array([search.own])
+        settled = np.concatenate([pose[None], settle(best, (0,))])
+        return settled, self.evidence(self.choice, frame, pyramid).costs(self.body, settled)
 
     def improved(self, frame: Observation, pyramid: Pyramid, pose: Float) -> Float:
         """Return the pose (D,), or the best one of a limb search if that costs :data:`GAIN` less."""

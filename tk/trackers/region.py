@@ -39,8 +39,9 @@ from tk.model.masks.silhouettes import Pyramid
 from tk.model.setup import Setup, Subject
 from tk.optim.gauss_newton import GaussNewtonSettings, Prior
 from tk.settings import RegionSettings, Settings, SilhouetteSettings
-from tk.trackers.contour_tracker import GAIN, RECOVER_EVERY, SAME_POSE_M, ContourTracker
+from tk.trackers.contour_tracker import GAIN, RECOVER_EVERY, ContourTracker
 from tk.trackers.hypotheses import MARGIN, PATIENCE, RENEWAL, Hypothesis, disagreement
+from tk.trackers.limb_search import SAME_POSE_M
 from tk.trackers.protocol import Estimate, Observation, Stopwatch
 from tk.trackers.residual import ResidualBaseline, variance_factor
 from tk.trackers.second_pass import SecondPass

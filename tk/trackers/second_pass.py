@@ -25,8 +25,9 @@ from tk.model.body.joint_sigma import directions, posture_variance
 from tk.model.body.skeleton import JOINTS, Skeleton
 from tk.model.cues.ray_costs import Evidence, residual_of
 from tk.model.masks.silhouettes import Pyramid
-from tk.trackers.contour_tracker import GAIN, SAME_POSE_M
+from tk.trackers.contour_tracker import GAIN
 from tk.trackers.hypotheses import MARGIN, RENEWAL, Hypothesis, disagreement
+from tk.trackers.limb_search import SAME_POSE_M
 
 if TYPE_CHECKING:
     from tk.trackers.region import RegionTracker
