@@ -4,7 +4,8 @@ The recording is divided into spans of about ten seconds. In each span the segme
 over it (:class:`~tk.segmenters.people_masks.PeopleMasks`), and the empty scene is learned from them
 (:class:`~tk.model.masks.learned_scene.LearnedScene`). All other masks are a segmentation against that scene. Where the
 scene is unknown, the segmenter's masks before and after the frame decide; where they differ, pixels are uncertain. The
-asked frames are also a check: between two of which one disagrees with the segmentation, the segmenter makes all masks.
+asked frames are also a check: around one in which the segmentation disagrees, the segmenter makes all masks between the
+asked frames before and after it.
 
 The masks of a frame depend on the recording alone, so `--resume` and `--frames` see the same masks. In a source of
 unknown length the scene is learned from the frames asked for so far; until they are enough, the segmenter makes all
@@ -52,8 +53,8 @@ _PAST, _EVERY = 16, 4
 _SHARE = 0.16
 # Most bytes of a span's samples. With fewer samples, more of the scene is unknown.
 _SAMPLE_BYTES = 512_000_000
-# Pixels in one of two masks only, as a share of those in any, beyond which the learned scene is not used. The share is
-# 0.05 to 0.2 on walk and dance; from above 0.3 to 0.6 on walk, where the segmenter, not the scene, misses the head.
+# Masks disagree if more than this share of the pixels in either is in only one of them. The share is 0.05 to 0.2 on
+# walk and dance; in a camera above, 0.3 to 0.6 on walk, where the segmenter, not the scene, misses the head.
 _DISAGREE = 0.65
 
 

@@ -243,8 +243,8 @@ def refine_if_inconsistent(
 def whole_delays(
     body: ConeBody, rig: Rig, masks: Callable[[int], NDArray[np.uint8]], tracked: TrackedPoses
 ) -> NDArray[np.int64]:
-    """Return (C,) whole frames by which each video is late: with the masks of so many frames before, the body explains
-    a camera that it otherwise explains worse than the others. Arguments as of :func:`refine_rig`."""
+    """Return (C,) whole frames by which each video is late. The body explains the masks of a late video worse than
+    those of the others, and those of some frames earlier well. Arguments as of :func:`refine_rig`."""
     late = np.zeros(len(rig), np.int64)
     frames, known = tracked.frames, set(tracked.frames.tolist())
     shifts = range(-LARGEST_DELAY, LARGEST_DELAY + 1)

@@ -42,7 +42,7 @@ Float = NDArray[np.float64]
 
 # Standard deviation of the logarithm of a stature that was estimated from the silhouettes: their areas err by 6 %.
 ESTIMATED_STATURE_DEVIATION = 0.05
-# A person who is lost in consecutive frames is searched for, from the centroid of the silhouettes, in every so many.
+# As long as a person stays lost, the search from the centroid of the silhouettes runs once in so many frames.
 RECOVER_EVERY = 3
 # Of the poses from which a lost person is searched for at the coarsest scale, one in RECOVERY_KEPT goes on to the finer
 # ones, if its residual is below HALVED times the current one: no finer scale halves a residual.

@@ -10,8 +10,8 @@ One frame:
 
 Contours and equations are the silhouette paper's (sections 4.1 to 4.3); the colour differences are those of
 region-based tracking (Stoiber et al., *SRT3D*, IJCV 2022). The search replaces the first paper's Stochastic Meta
-Descent and its visual hull: a limb lies in the hull and fills it if it lies in all silhouettes and leaves no ray of
-them without a part. Rays measure this directly, at the images' resolution instead of the voxels'.
+Descent and its visual hull, which a limb should lie in and fill. Rays measure the same in the images, at a finer
+resolution: every part should lie in all silhouettes, and every ray of a silhouette should meet a part.
 """
 
 from __future__ import annotations

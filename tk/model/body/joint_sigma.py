@@ -60,8 +60,8 @@ def view_variance(rays: Float, shares: Float, view_m: float = VIEW_M) -> Float:
 
     A view measures a joint's position across its ray only, and only as far as it shows the joint's bones. Priors and
     motion are no evidence of a position, so they do not count. This is the covariance of triangulation with weights
-    (Hartley and Zisserman, *Multiple View Geometry*, 2nd ed., section 12.6), beyond that of one full view across each
-    direction: so much three cameras around the person give, and the contours' noise covers it.
+    (Hartley and Zisserman, *Multiple View Geometry*, 2nd ed., section 12.6), minus that of one full view across each
+    direction: three cameras around the person give as much, and the contours' noise covers it.
 
     Args:
         rays: (..., V, J, 3) unit vectors between the cameras and the joints.

@@ -2,9 +2,9 @@
 
 Gauss-Newton on the equations of :mod:`tk.model.cameras.bundle`. Three gauges cannot be observed: a rigid motion of the
 world and its scale, fixed by aligning the cameras with the given ones, and the common delay of all cameras, fixed by
-calling one camera's clock right. A prior about the given calibration decides what is badly observed: a camera that is
-turned and moved such that the person keeps the place in the image shows it only by the person's depth. The body's
-dimensions and shapes are unknowns, too: a body too thin for its clothes would otherwise push every camera back.
+calling one camera's clock right. A prior about the given calibration decides what is badly observed: if a camera is
+turned and moved so that the person stays in place in its image, only the person's depth shows it. The body's dimensions
+and shapes are unknowns, too: a body too thin for its clothes would otherwise push every camera back.
 """
 
 from __future__ import annotations

@@ -28,8 +28,8 @@ COLOR_COST = 0.4
 # Cost of a part on a pixel outside the mask that is uncertain (a shadow, or clothes of the background's colour): both
 # values are equally likely.
 UNCERTAIN_COST = 0.5
-# Beside pixels of other people, a view of whose pixels few show the person counts as if it showed this share of those
-# in the view that shows most, so that a hand beside another person's back does not count as much as a whole person.
+# Costs of a view are divided by the number of the person's rays. Where others hide most of the person, the divisor is
+# at least this share of the largest number in any view, so that a hand beside a back counts less than a person.
 # Chosen on pair. With one person (dance and cube, 50 frames) half and twice the value change no mean error.
 LEAST_SEEN = 0.25
 

@@ -221,5 +221,5 @@ class CoarseHull:
 
 
 def dilated(mask: NDArray, by: int) -> Bool:
-    """Return a mask (h, w) grown by so many pixels on all sides."""
+    """Return a mask (h, w) grown by ``by`` pixels on all sides."""
     return cv2.dilate(mask.astype(np.uint8), np.ones((2 * by + 1, 2 * by + 1), np.uint8)).astype(bool)
