@@ -16,7 +16,7 @@ from tests.export.test_opensim import read_trc
 from tk.errors import ExportError, ResultError
 from tk.export import FORMATS, Motion, export, read_motion
 from tk.io.results.status import Status
-from tk.model.body.angles import segment_rotations
+from tk.model.body.angles import standing_rotations
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.joints import FOOT_POINTS
 from tk.model.body.rotations import to_quaternions
@@ -66,7 +66,7 @@ def test_without_a_waist(write: Write) -> None:
 
 def test_stored_quantities_are_exported_rather_than_recomputed(write: Write) -> None:
     """Rotations and feet are the file's, in the order of its names."""
-    q = to_quaternions(segment_rotations(SKELETON, poses()))[:, ::-1]
+    q = to_quaternions(standing_rotations(SKELETON, SKELETON.segment_transforms(poses())))[:, ::-1]
     feet = np.arange(12.0).reshape(4, 3)
     meta = {"segment_names": SEGMENTS[::-1], "feet": True}
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tk.model.body.angles import ANGLES, FORWARD_UP_RIGHT, MIRROR, joint_angles, segment_rotations, standing_axes
+from tk.model.body.angles import ANGLES, FORWARD_UP_RIGHT, MIRROR, joint_angles, standing_axes, standing_rotations
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.gait_poses import neutral_pose
 from tk.model.body.rotations import compose
@@ -44,6 +44,10 @@ def joint_rotation(joint: str, degrees: np.ndarray) -> np.ndarray:
     R = compose(angles.sequence, turns)
     R = MIRROR @ R @ MIRROR if angles.mirrored else R
     return FORWARD_UP_RIGHT.T @ R @ FORWARD_UP_RIGHT
+
+
+def segment_rotations(skeleton: Skeleton, poses: np.ndarray) -> np.ndarray:
+    return standing_rotations(skeleton, skeleton.segment_transforms(poses))
 
 
 def angles_of(pose: np.ndarray, skeleton: Skeleton = SKELETON) -> dict[str, dict[str, float]]:

@@ -131,13 +131,11 @@ def _sets() -> tuple[AngleSet, ...]:
 ANGLES: tuple[AngleSet, ...] = _sets()
 
 
-def segment_rotations(skeleton: Skeleton, poses: Float) -> Float:
-    """Return rotations (F, S, 3, 3) from the segments' axes (defined above) to the world, from poses (F, D)."""
-    return standing_rotations(skeleton, skeleton.segment_transforms(poses))
-
-
 def standing_rotations(skeleton: Skeleton, transforms: Float) -> Float:
-    """Return the rotations of :func:`segment_rotations` from :meth:`Skeleton.segment_transforms`."""
+    """Return rotations (F, S, 3, 3) from the segments' axes (defined above) to the world.
+
+    ``transforms`` are those of :meth:`Skeleton.segment_transforms`.
+    """
     return transforms[..., :3, :3] @ skeleton.T_world_body @ standing_axes()
 
 
@@ -152,7 +150,7 @@ def joint_angles(rotations: Float, T_world_body: Float, segments: Sequence[str] 
     """Return the angles by joint, degrees, each (..., k) with the columns of :data:`ANGLES`.
 
     Args:
-        rotations: (..., S, 3, 3) from :func:`segment_rotations`.
+        rotations: (..., S, 3, 3) from :func:`standing_rotations`.
         T_world_body: (3, 3) the world's forward, left and up axes as columns; see :class:`Skeleton`.
         segments: names of the S segments.
     """
