@@ -36,11 +36,10 @@ from tk.trackers.protocol import TwoPassTracker
 Float = NDArray[np.float64]
 Note = Callable[[str], None]
 
-# Frames of a refinement, at most and at least, and of a check of the cameras' agreement. On dance with turned cameras
+# Frames of a refinement, and of a check of the cameras' agreement, at most and at least. On dance with turned cameras
 # 16, 24 and 40 frames give the same joints within 0.02 cm. Fewer than eight show little motion; these
 # recordings are longer, so the least number changes nothing on them.
 FRAMES, FEWEST = 20, 8
-AGREEMENT_FRAMES = 20
 # Refined cameras are used if they reduce the contours' distance to less than this share. One of five cameras turned by
 # the least angle that counts as inconsistent, 0.06° or 0.8 px, reduces a distance of 1.4 px to 0.96 of it. On dance
 # with turned cameras the share is 0.87.
@@ -192,7 +191,7 @@ def compare_cameras(tracker: TwoPassTracker, store: MaskStore, tracked: TrackedP
     :func:`refine_if_inconsistent`."""
     tracked = replace(tracked, poses=tracker.world.poses_in(tracked.poses))
     masks = lru_cache(16)(store.get)
-    chosen = choose_frames(masks, tracker.views, tracker.body.skeleton, tracked, AGREEMENT_FRAMES, 1, False)
+    chosen = choose_frames(masks, tracker.views, tracker.body.skeleton, tracked, FRAMES, 1, False)
     return camera_agreement(tracker.body, tracker.world.rig, chosen) if len(chosen) >= FEWEST else None
 
 
