@@ -67,24 +67,20 @@ class Views:
         # everything happens inside boxes around the people
         crops = [(slice(y, y + h), slice(x, x + w)) for x, y, w, h in map(cv2.boundingRect, masks)]
         shared = any((mask[crop] == OTHERS).any() for mask, crop in zip(masks, crops, strict=True))
-        others = masks == OTHERS if shared else None
         if cleaning:
             cleaned = np.zeros_like(masks)
             for out, mask, crop in zip(cleaned, masks, crops, strict=True):
-                if mask[crop].size:
-                    out[crop] = clean(mask[crop])
-            if others is not None:  # a region that others cut off may be small: it is no evidence, not background
-                others |= (masks >= 128) & (cleaned == 0)
+                if (part := mask[crop]).size:
+                    out[crop] = kept = clean(part)
+                    if shared:  # a region that others cut off may be small: it is no evidence, not background
+                        out[crop][(part == OTHERS) | ((part >= 128) & (kept == 0))] = OTHERS
             masks = cleaned
         V, H, W = masks.shape
         levels = [masks, *(np.zeros((V, -(-H // 2**k), -(-W // 2**k)), np.uint8) for k in range(1, scales))]
         sizes = [-(-self.sizes // 2**k) for k in range(scales)]
         for v, crop in enumerate(crops):
             if masks[v][crop].size:
-                _halve([level[v] for level in levels], crop)
-        if others is not None:
-            for k, level in enumerate(levels):
-                levels[k] = _marked(level, others, 2**k)
+                _halve([level[v] for level in levels], crop, shared)
         return Pyramid(tuple(levels), tuple(sizes))
 
     def at(self, pyramid: Pyramid, scale: int) -> Silhouettes:
@@ -92,8 +88,11 @@ class Views:
         return Silhouettes(self._cameras32, pyramid.sizes[scale], pyramid.masks[scale], 2.0**scale)
 
 
-def _halve(levels: Sequence[Masks], crop: tuple[slice, slice]) -> None:
-    """Fill the coarser ones of a mask's scales, (H, W) and zero before, from the crop that contains the mask."""
+def _halve(levels: Sequence[Masks], crop: tuple[slice, slice], shared: bool) -> None:
+    """Fill the coarser ones of a mask's scales, (H, W) and zero before, from the crop that contains the mask.
+
+    ``shared``: there are pixels of other people; each pixel that contains one of them gets their value.
+    """
     whole, step = levels[0], 2 ** (len(levels) - 1)
     (top, bottom), (left, right) = ((s.start // step * step, -(-s.stop // step) * step) for s in crop)
     part = whole[top:bottom, left:right]
@@ -102,25 +101,17 @@ def _halve(levels: Sequence[Masks], crop: tuple[slice, slice]) -> None:
         part = np.asarray(cv2.copyMakeBorder(part, 0, below, 0, beside, cv2.BORDER_CONSTANT), np.uint8)
     for level in levels[1:]:
         top, left = top // 2, left // 2
-        part = np.asarray(cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
+        others = _halved(np.uint8(255) * (part == OTHERS)) > 0 if shared else None
+        part = _halved(part)
+        if others is not None:
+            part[others] = OTHERS
         place = level[top : top + part.shape[0], left : left + part.shape[1]]
         place[...] = part[: place.shape[0], : place.shape[1]]
 
 
-def _marked(level: Masks, others: NDArray[np.bool_], step: int) -> Masks:
-    """Return a scale's masks (V, h, w) in which each pixel that contains one of the others' (V, H, W) has their value.
-
-    ``step``: pixels of the full image along a side of the scale's pixel.
-    """
-    _, h, w = level.shape
-    marked = level.copy()
-    for out, own in zip(marked, others.view(np.uint8), strict=True):
-        if step > 1:  # the mean over a pixel is positive if it contains one of the others'
-            below, right = h * step - own.shape[0], w * step - own.shape[1]
-            padded = cv2.copyMakeBorder(255 * own, 0, below, 0, right, cv2.BORDER_CONSTANT)
-            own = cv2.resize(padded, (w, h), interpolation=cv2.INTER_AREA)
-        np.copyto(out, np.uint8(OTHERS), where=own > 0)
-    return marked
+def _halved(part: Masks) -> Masks:
+    """Return the means (h/2, w/2) of the squares of four pixels."""
+    return np.asarray(cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def share_wrong(drawn: Masks, seen: Masks) -> Float:
