@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import scipy  # its packages are imported when they are first used
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
@@ -409,9 +408,8 @@ class PeopleFinder:
         for peak in peaks:
             height = smooth[tuple(peak)]
             steps = np.linspace(0, 1, 20)[:, None]
-            between = [
-                scipy.ndimage.map_coordinates(smooth, (peak + steps * (o - peak)).T, order=1).min() for o in kept
-            ]
+            ways = [(peak + steps * (other - peak)).astype(np.float32) for other in kept]
+            between = [cv2.remap(smooth, way[:, 1], way[:, 0], cv2.INTER_LINEAR).min() for way in ways]
             if all(lowest <= saddle * height for lowest in between):
                 kept.append(peak)
             if len(kept) == _MOST:  # masks that are full everywhere have a maximum in every cell
