@@ -409,7 +409,7 @@ class ContourTracker:
             Poses (B, D), the current one first, and their costs (B,).
         """
 
-        def settle(poses: Float, levels: Sequence[int], limb: Limb | None = None) -> Float:
+        def settle(poses: Float, levels: Sequence[int], limb: Limb | None) -> Float:
             return self.settle(pyramid, poses, levels, images, limb=limb).states
 
         search = LimbSearch(self.body, self.limbs, evidence, settle, pose)
@@ -417,7 +417,7 @@ class ContourTracker:
         best = search.better(min(1, self.solver.scales - 1), misplaced, rng)
         if not len(best):
             return pose[None], np.array([search.own])
-        settled = np.concatenate([pose[None], settle(best, (0,))])
+        settled = np.concatenate([pose[None], settle(best, (0,), None)])
         return settled, self.evidence(self.choice, frame, pyramid).costs(self.body, settled)
 
     def improved(self, frame: Observation, pyramid: Pyramid, pose: Float) -> Float:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,24 +31,15 @@ FINISHED = 2
 SAME_POSE_M = 0.05
 
 
-class Settle(Protocol):
-    """Minimises from poses (B, D) in the frame; returns the poses (B, D) that it reaches."""
-
-    def __call__(self, poses: Float, levels: Sequence[int], limb: Limb | None = None) -> Float: ...
+#: minimises from poses (B, D) in a frame at some scales, and returns the poses reached; with a limb, only that moves
+Settle = Callable[[Float, Sequence[int], Limb | None], Float]
 
 
 class LimbSearch:
-    """The search around one pose.
-
-    Args:
-        body: the person's body.
-        limbs: its limbs.
-        evidence: the frame's costs, on a coarse grid.
-        settle: the minimisation in the frame; with a limb, only that limb moves.
-        pose: (D,) current pose.
+    """The search around a pose (D,) of a body with limbs, given the frame's costs on a coarse grid.
 
     Attributes:
-        own: the cost of the current pose.
+        own: the cost of the pose.
     """
 
     def __init__(self, body: ConeBody, limbs: Sequence[Limb], evidence: Evidence, settle: Settle, pose: Float) -> None:
@@ -71,7 +61,7 @@ class LimbSearch:
         moved = [(limb.dofs, self._moved(limb, level, limb in misplaced, rng)) for limb in self._limbs]
         found = [(dofs, poses) for dofs, poses in moved if len(poses)]
         swaps = np.array([exchanged(self._pose, *pair) for pair in pairs(self._limbs)])
-        swaps = self._settle(swaps, (level, 0))
+        swaps = self._settle(swaps, (level, 0), None)
         swaps = swaps[self._evidence.costs(self._body, swaps) < self.own + PROMISING]
         poses = [*swaps, *(one for _, some in found for one in some)]
         for i, (_, first) in enumerate(found):
