@@ -13,7 +13,7 @@ from tk.kernels.raycast import FAR
 from tk.model.cues.part_colors import RenderedBody, color_bins
 from tk.model.cues.ray_costs import RayGrid
 from tk.trackers.protocol import Observation
-from tk.trackers.sharing import NOBODY, UNCLEAR, PixelOwners, assign, enlarged
+from tk.trackers.sharing import NOBODY, PixelOwners, assign, enlarged
 
 RIG = ring_of_cameras(4, width=160, height=200)
 GRID, EXACT = RayGrid(RIG, 50), RayGrid(RIG, 200)
@@ -45,11 +45,10 @@ def expected(pose: np.ndarray, color: np.ndarray | None = None) -> RenderedBody:
     return RenderedBody(met.label[0], met.depth[0], np.zeros(len(BODY.parts), np.int32), log_likelihood)
 
 
-def shares(found: PixelOwners, front: np.ndarray) -> tuple[float, float]:
-    """Return the shares of the people's pixels with the right owner, and with a wrong one (not: unclear)."""
-    shown = front >= 0
-    right, wrong = found.owner == front, (found.owner >= 0) & (found.owner != front)
-    return np.count_nonzero(right & shown) / shown.sum(), np.count_nonzero(wrong & shown) / shown.sum()
+def right(bodies: list[RenderedBody], front: np.ndarray, frame: Observation) -> float:
+    """Return the share of the people's pixels with the right owner."""
+    owner, shown = assign(RIG, GRID, bodies, frame).owner, front >= 0
+    return np.count_nonzero((owner == front) & shown) / np.count_nonzero(shown)
 
 
 def test_people_overlap_in_two_views() -> None:
@@ -58,26 +57,20 @@ def test_people_overlap_in_two_views() -> None:
 
 
 def test_pixels_belong_to_the_body_in_front() -> None:
-    front, frame = drawn(POSES)
-    right, wrong = shares(assign(RIG, GRID, [expected(pose) for pose in POSES], frame), front)
-    assert right > 0.8 and wrong < 0.02  # pixels within 4 cm, the error that is expected, of a border are unclear
+    assert right([expected(pose) for pose in POSES], *drawn(POSES)) > 0.98
 
 
 def test_colors_decide_where_bodies_alone_do_not() -> None:
     """The people are not exactly where they are expected."""
-    front, frame = drawn(POSES)
     moved = POSES.copy()
     moved[:, :2] += [[0.04, 0.06], [-0.06, 0.04]]
-    right_without, _ = shares(assign(RIG, GRID, [expected(pose) for pose in moved], frame), front)
+    assert right([expected(pose) for pose in moved], *drawn(POSES)) < 0.96
     with_colors = [expected(pose, color) for pose, color in zip(moved, COLORS, strict=False)]
-    right, wrong = shares(assign(RIG, GRID, with_colors, frame), front)
-    assert right_without < 0.9 and right > 0.98 and wrong < 0.02
+    assert right(with_colors, *drawn(POSES)) > 0.985
 
 
 def test_people_of_one_color_are_separated_by_their_bodies() -> None:
-    front, frame = drawn(POSES, COLORS[[0, 0]])
-    right, wrong = shares(assign(RIG, GRID, [expected(pose, COLORS[0]) for pose in POSES], frame), front)
-    assert right > 0.8 and wrong < 0.02
+    assert right([expected(pose, COLORS[0]) for pose in POSES], *drawn(POSES, COLORS[[0, 0]])) > 0.98
 
 
 def block(left: int, right: int, depth_m: float) -> RenderedBody:
@@ -109,12 +102,14 @@ def test_a_wide_body_far_in_front_of_another_owns_what_both_cover() -> None:
     assert (owner[:, 20, 2:38] == 0).all()
 
 
-def test_pixels_are_unclear_where_two_bodies_are_equally_near_and_colors_are_unknown() -> None:
+def test_each_pixel_is_evidence_for_one_of_two_people() -> None:
     bodies = [block(5, 20, 3.0), block(15, 30, 3.01)]
-    found, frame = assign(RIG, GRID, bodies, masks_of(*bodies)), masks_of(*bodies)
-    assert (GRID.sample(found.owner)[:, 20, 16:19] == UNCLEAR).all()
-    for person in (0, 1):
-        assert (GRID.sample(found.share(frame, person).masks)[:, 20, 16:19] == OTHERS).all()
+    frame = masks_of(*bodies)
+    found = assign(RIG, GRID, bodies, frame)
+    one, other = (found.share(frame, person).masks for person in (0, 1))
+    shown = frame.masks > 0
+    assert ((one == 255) ^ (other == 255))[shown].all() and (one[~shown] == 0).all()
+    assert (np.where(one == 255, other, one)[shown] == OTHERS).all()
 
 
 def test_pixels_far_from_all_bodies_belong_to_somebody_unknown() -> None:
