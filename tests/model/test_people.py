@@ -64,6 +64,15 @@ def test_people_are_counted_and_located(places: list[tuple[float, float]]) -> No
     assert all(1.5 < person.height_m < 2.0 and 0.04 < person.volume_m3 < 0.25 for person in found)
 
 
+def test_people_of_whom_others_hide_all_but_the_head_keep_their_height() -> None:
+    """Shadows, which are uncertain, too, lower a height: they add to the feet."""
+    (masks,) = drawn([(0.1, 0.2)])
+    hidden = np.zeros_like(masks)
+    hidden[0, np.flatnonzero(masks[0].any(axis=1))[0] + 8 :] = True
+    found, in_shadow = (FINDER.find(masks & ~hidden, **{name: hidden}) for name in ("hidden", "uncertain"))
+    assert 1.65 < found[0].height_m < 1.85 and in_shadow[0].height_m < 0.5
+
+
 def test_people_close_together_before_four_cameras_are_told_apart() -> None:
     """Their hull is one block, larger than one person's."""
     rig = Rig(ring_of_cameras(5, 240, 240).cameras[:4])

@@ -13,7 +13,7 @@ from tk.kernels.raycast import FAR
 from tk.model.cues.part_colors import RenderedBody, color_bins
 from tk.model.cues.ray_costs import RayGrid
 from tk.trackers.protocol import Observation
-from tk.trackers.sharing import NOBODY, PixelOwners, assign, enlarged
+from tk.trackers.sharing import NOBODY, assign, enlarged
 
 RIG = ring_of_cameras(4, width=160, height=200)
 GRID, EXACT = RayGrid(RIG, 50), RayGrid(RIG, 200)

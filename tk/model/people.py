@@ -161,7 +161,11 @@ class PeopleFinder:
         self._pixel_m2 = (np.linalg.norm(rig.centers - middle, axis=1) * self._step) ** 2 / focal
 
     def find(
-        self, masks: NDArray, uncertain: Bool | None = None, near: Sequence[LocatedPerson] = ()
+        self,
+        masks: NDArray,
+        uncertain: Bool | None = None,
+        near: Sequence[LocatedPerson] = (),
+        hidden: Bool | None = None,
     ) -> tuple[LocatedPerson, ...]:
         """Return the people, those in the working volume first, then by volume of their hull, the largest first.
 
@@ -171,18 +175,21 @@ class PeopleFinder:
         Args:
             masks: (C, H, W), other than 0 where people are.
             uncertain: (C, H, W) bool, pixels that may show a person although their mask is 0.
+            hidden: (C, H, W) bool, pixels of known people, who may hide others. Unlike shadows at the feet, they do not
+                lower a height.
             near: the people of the last frame. A component that holds the positions of several is split between them
                 if it is as large as they were together.
         """
         small = self._reduced(masks)
-        allowed = small if uncertain is None else small | self._reduced(uncertain)
+        unsure = small if uncertain is None else small | self._reduced(uncertain)
+        seen = (small, unsure, unsure if hidden is None else unsure | self._reduced(hidden))
         known = [c for c in range(len(self._rig)) if small[c].any()]
-        found = self._candidates(small, allowed, known, near)
+        found = self._candidates(seen, known, near)
         chosen = self._explaining(found, small)
         missed = np.flatnonzero(self._unexplained(small, chosen)).tolist()
         if 2 <= len(missed) < len(known):
             # only these cameras show somebody: he or she is hidden in the others, or their masks have a gap
-            chosen = self._explaining([*found, *self._candidates(small, allowed, missed, near)], small)
+            chosen = self._explaining([*found, *self._candidates(seen, missed, near)], small)
         chosen = [*self._on_one_floor(chosen), *self._alone(small, self._covered(chosen))]
         return tuple(sorted(chosen, key=lambda person: (not person.inside, -np.nan_to_num(person.volume_m3))))
 
@@ -297,14 +304,14 @@ class PeopleFinder:
         return np.asarray(masks[:, offset :: self._step, offset :: self._step] > 0)
 
     def _candidates(
-        self, shown: Bool, unsure: Bool, cameras: Sequence[int], near: Sequence[LocatedPerson]
+        self, seen: tuple[Bool, Bool, Bool], cameras: Sequence[int], near: Sequence[LocatedPerson]
     ) -> list[LocatedPerson]:
-        """Return who may be in the cameras' hull; the masks in reduced images (C, h, w), without and with the uncertain
-        pixels."""
-        self._flat, self._voxels = self._table.near_hull(shown, unsure, cameras)
-        inside, allowed = (self._voxels.inside(masks) & self._voxels.sees for masks in (shown, unsure))
+        """Return who may be in the cameras' hull; the masks in reduced images (C, h, w), with the uncertain pixels,
+        and with the hidden ones, too."""
+        self._flat, self._voxels = self._table.near_hull(seen[0], seen[2], cameras)
+        inside, unsure, allowed = (self._voxels.inside(masks) & self._voxels.sees for masks in seen)
         parts = self._components(inside, allowed, cameras, near)
-        return [self._person(part, inside, allowed) for part in parts]
+        return [self._person(part, inside, unsure) for part in parts]
 
     def _components(
         self, inside: Bool, allowed: Bool, cameras: Sequence[int], near: Sequence[LocatedPerson]
@@ -312,7 +319,7 @@ class PeopleFinder:
         """Return the voxels of each component of the cameras' hull that may be a person; wide components are split.
 
         Args:
-            inside, allowed: (C, N) whether the mask, or the mask with its uncertain pixels, shows a voxel.
+            inside, allowed: (C, N) whether the mask, or the mask with its uncertain and hidden pixels, shows a voxel.
             cameras: the cameras of the hull; each of its voxels is in two masks or more.
             near: see :meth:`find`.
         """
@@ -416,11 +423,11 @@ class PeopleFinder:
                 break
         return np.array(kept).reshape(-1, 2)
 
-    def _person(self, part: NDArray[np.int64], inside: Bool, allowed: Bool) -> LocatedPerson:
+    def _person(self, part: NDArray[np.int64], inside: Bool, unsure: Bool) -> LocatedPerson:
         points, edge = self._voxels.centers[part], self._grid.voxel_m
         sees = self._voxels.sees[:, part]
         # shadows are uncertain, and add to feet and head
-        certain = ~(allowed[:, part] & ~inside[:, part]).any(axis=0)
+        certain = ~(unsure[:, part] & ~inside[:, part]).any(axis=0)
         height = points[certain if certain.any() else slice(None)] @ self._to_plan[2]
         floor, crown = float(height.min()) - edge / 2 + _EXCESS_M, float(height.max()) + edge / 2
         position = np.array([*self._trunk(part), (floor + crown) / 2]) @ self._to_plan
