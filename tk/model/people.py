@@ -111,6 +111,11 @@ class LocatedPerson:
     share: Float
     inside: bool
 
+    @property
+    def where(self) -> str:
+        """The position in words."""
+        return "({:.1f}, {:.1f}, {:.1f}) m".format(*self.position)
+
 
 def order_people(
     people: Sequence[LocatedPerson], volume: Volume, height_m: float | None = None, position: Float | None = None

@@ -52,6 +52,13 @@ def chosen(
                 f"person {missing[0]} is asked for, but {len(found)} were found in the first frame; the numbers "
                 "start at 0, see tk inspect"
             )
+        for n in choice:
+            if found[n].views.sum() < 2:
+                raise CaptureError(
+                    f"person {n} is seen by one camera in the first frame, and two are needed: choose all, or a later "
+                    "first frame",
+                    hint="with --frames N:",
+                )
         return choice
     if choice == "all":
         return tuple(present) or (0,)
@@ -60,9 +67,8 @@ def chosen(
     if place is not None and found:
         number = int(np.argmin([np.linalg.norm(person.position - place) for person in found]))
     if len(found) > 1:
-        x, y, z = found[number].position
         note(
-            f"{len(found)} people are in view, and number {number} is tracked, at ({x:.1f}, {y:.1f}, {z:.1f}) m; "
+            f"{len(found)} people are in view, and number {number} is tracked, at {found[number].where}; "
             "the option people chooses others by the numbers that tk inspect prints, or all"
         )
     return (number,)

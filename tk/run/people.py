@@ -161,13 +161,8 @@ class People:
             if not self.refusal:
                 _LOG.info("waiting: nobody stands in the working volume in frame %d", frame.index)
             if found or not self.refusal:
-                at = "".join(
-                    " (outside it, somebody stands at ({:.1f}, {:.1f}, {:.1f}) m)".format(*person.position)
-                    for person in found[:1]
-                )
-                self.refusal = (
-                    f"the working volume is empty in all frames{at}; check the masks, and [volume] in capture.toml"
-                )
+                at = f", but somebody stands outside it, at {found[0].where}" if found else ""
+                self.refusal = f"the working volume is empty{at}; check the masks, and [volume] in capture.toml"
             self._refused = 0
             return False
         if frame.index < self._admit_from:
@@ -222,17 +217,8 @@ class People:
         rest = [person for n, person in enumerate(found) if n not in numbers and person.views.sum() >= 2]
         shares = self._shares([*people, *rest], opening)
         refusal = opening_agreement(self._setup, opening).refusal
-        for number, member, frames, person in zip(numbers, self._tracked, shares, people, strict=False):
-            try:
-                self._begin(member, frames, person.height_m, refusal)
-            except CaptureError as error:
-                if person.inside:
-                    raise
-                raise CaptureError(
-                    f"person {number} is outside the working volume in frame {opening[0].index} and cannot be tracked "
-                    "from there: choose all, or a later first frame",
-                    hint="with --frames N:",
-                ) from error
+        for member, frames, person in zip(self._tracked, shares, people, strict=False):
+            self._begin(member, frames, person.height_m, refusal)
         for person, frames in zip(rest, shares[len(people) :], strict=True):
             if person.inside:
                 self._admit(frames, person, unknown(subjects[0]), written=False)
@@ -410,8 +396,7 @@ class People:
             if newcomer is not None and newcomer.written:
                 self._note(f"frame {frame.index}: person {newcomer.number} has entered")
             elif newcomer is not None:
-                x, y, z = person.position
-                self._note(f"frame {frame.index}: another person is in view, at ({x:.1f}, {y:.1f}, {z:.1f}) m")
+                self._note(f"frame {frame.index}: another person is in view, at {person.where}")
 
     def _newcomers(self, frame: Observation, owners: PixelOwners) -> list[LocatedPerson]:
         """Return the people in the working volume whom the pixels show that no body explains."""
