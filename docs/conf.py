@@ -18,5 +18,5 @@ autodoc_typehints = "none"  # docstrings give shapes and units
 autodoc_member_order = "bysource"
 napoleon_google_docstring = True
 napoleon_use_rtype = False
-# Attributes with comma-separated names are told as a list of their own
+# Attributes with comma-separated names make a list of their own
 napoleon_use_ivar = True
