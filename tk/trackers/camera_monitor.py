@@ -88,7 +88,7 @@ class CameraMonitor:
         self.tracker, self._setup, self._subject = tracker, setup, subject
         self._names = setup.rig.names
         self._health = ImageHealth()
-        self._plausibility = Plausibility(setup.up, setup.fps)
+        self._plausibility = Plausibility(setup.fps)
         C = len(self._names)
         self._excluded = np.zeros(C, bool)
         self._tested = False
@@ -101,7 +101,7 @@ class CameraMonitor:
         self._opening_reasons: dict[int, str] = {}
         self._refused = np.zeros((), np.int64)  # poses refused since the last accepted one, because of their residual
         self._recent = np.full((RECENT, C, 2), np.nan)  # residuals of the last frames
-        self._excess = 0.0  # of the last frame, mean over the cameras used
+        self._excess = 0.0  # of this frame, mean over the cameras used; 0 if it was not tested
 
     def start(self, frames: Sequence[Observation]) -> list[Observation]:
         """Return the opening frames without the cameras that are wrong, for the tracker's start.
@@ -157,16 +157,16 @@ class CameraMonitor:
         monitored = isinstance(self.tracker, RegionTracker) and len(out) - bad.sum() >= 3
         before = self.tracker.state() if monitored else {}
         estimate = self.tracker.step(used)
-        offset = None
+        self._excess = 0.0
         if monitored and shows_person(used.masks).any() and estimate.residual is not None:
-            estimate, used, offset = self._test(frame, used, bad, before, estimate)
+            estimate, used = self._test(frame, used, bad, before, estimate)
         for camera, reason in enumerate(unhealthy):
             if reason is not None and bad[camera]:
                 _count(self._spans, f"{camera}/{reason}", frame.index)
         for camera in np.flatnonzero((out | self._excluded) & ~bad).tolist():
             reason = _MISSING if self._torn[camera] else _DISAGREES
             _count(self._spans, f"{camera}/{reason}", frame.index)
-        return self._suspect(self._plausible(frame.index, estimate, used, offset)), used
+        return self._suspect(self._plausible(frame.index, estimate, used)), used
 
     def _bad(self, unhealthy: Sequence[str | None]) -> NDArray[np.bool_]:
         """Return (C,) the cameras whose image excludes them. Trackers of hulls need all cameras."""
@@ -174,20 +174,15 @@ class CameraMonitor:
 
     def _test(
         self, frame: Observation, used: Observation, bad: NDArray[np.bool_], before: Mapping[str, Any], first: Estimate
-    ) -> tuple[Estimate, Observation, Float]:
-        """Exclude a camera that is wrong, and include those again that are right.
-
-        Returns:
-            the estimate, the observation without the excluded cameras, and (C,) the offset of each used camera's mask
-            from the body, see :func:`_offset`.
-        """
+    ) -> tuple[Estimate, Observation]:
+        """Exclude a camera that is wrong, and include those again that are right; return the estimate, and the
+        observation without the excluded cameras."""
         tracker = self.tracker
         assert isinstance(tracker, RegionTracker) and first.residual is not None
         baseline = tracker.residuals
-        error, offset = first.residual.sum(axis=1), _offset(first.residual)
+        error = first.residual.sum(axis=1)
         if self._excluded.any() or np.nanmax(baseline.excess(error), initial=0.0) > OUTLIER:
-            residual = self._residual(frame, first)
-            error, offset = residual.sum(axis=1), _offset(residual)
+            error = self._residual(frame, first).sum(axis=1)
         excess = baseline.excess(error)
         usable = ~bad & np.isfinite(error)
         self._normal_for = np.where(usable & (excess < self._normal), self._normal_for + 1, 0)
@@ -206,44 +201,33 @@ class CameraMonitor:
             tracker.rewind(before)
             second = tracker.step(fewer)
             residual = self._residual(frame, second)
-            again = residual.sum(axis=1)
-            if self._is_wrong(worst, residual, error, others, second.joints):
+            if self._is_wrong(worst, residual, others, second.joints):
                 self._excluded[worst] = True
                 self._torn[worst] = residual[worst, 1] < _TORN * residual[worst, 0]
                 estimate, used, kept = replace(second, status=first.status), fewer, others
-                error, offset = again, _offset(residual)
+                error = residual.sum(axis=1)
             else:
                 tracker.rewind(after)
                 self._since_test[worst], self._at_test[worst] = 0, excess[worst]
         self._excess = tracker.residuals.mean_excess(np.where(kept, error, np.nan))
         self._excluded &= ~back
-        return estimate, used, np.where(kept, offset, np.nan)
+        return estimate, used
 
-    def _is_wrong(self, camera: int, residual: Float, before: Float, others: NDArray[np.bool_], joints: Float) -> bool:
+    def _is_wrong(self, camera: int, residual: Float, others: NDArray[np.bool_], joints: Float) -> bool:
         """Return whether a camera is wrong, by the joints (J, 3) and the residual (C, 2) of the pose without it.
 
         Cameras that see the person from the same or from opposite sides contradict no other camera, because they do not
-        determine a pose.
-        If the other cameras have a high residual too, the pose is wrong instead. Surplus area alone, such as a second
-        person in the mask, hardly misleads contours: it counts only if the others' E_S falls without the camera, from
-        ``before`` (C,), by one spread. A pose from two cameras is uncertain, so a third must have twice the excess.
+        determine a pose. If the other cameras have a high residual too, the pose is wrong instead. Surplus area alone,
+        such as a second person in the mask, hardly misleads contours: it does not count.
         """
         assert isinstance(self.tracker, RegionTracker)
         rays = joints.mean(axis=0) - self._setup.rig.centers[others]
         if depth_information(rays / np.linalg.norm(rays, axis=1, keepdims=True)) < LEAST_INFORMATION:
             return False
         baseline, error = self.tracker.residuals, residual.sum(axis=1)
-        excess_of_others = baseline.mean_excess(np.where(others, error, np.nan))
-        if excess_of_others > baseline.threshold:
+        if baseline.mean_excess(np.where(others, error, np.nan)) > baseline.threshold:
             return False
-        many = others.sum() >= 3
-        missing = baseline.excess(residual[:, 0])[camera] > (OUTLIER if many else 2 * OUTLIER)
-        relief = baseline.mean_excess(np.where(others, before, np.nan)) - excess_of_others
-        return bool(
-            missing
-            or error[camera] > _UNRELATED
-            or (many and baseline.excess(error)[camera] > OUTLIER and relief > 1.0)
-        )
+        return bool(baseline.excess(residual[:, 0])[camera] > OUTLIER or error[camera] > _UNRELATED)
 
     def _residual(self, frame: Observation, estimate: Estimate) -> Float:
         """Return (C, 2) missing and surplus area at the estimate's pose, of excluded cameras, too. Missing area on
@@ -266,7 +250,7 @@ class CameraMonitor:
             residual[:, 0] -= np.where(excused < _TOO_LITTLE, excused, 0.0)
         return residual
 
-    def _plausible(self, index: int, estimate: Estimate, used: Observation, offset: Float | None) -> Estimate:
+    def _plausible(self, index: int, estimate: Estimate, used: Observation) -> Estimate:
         """Return the estimate, with status lost if it is impossible."""
         if estimate.status == "lost":
             self._plausibility.forget()
@@ -275,8 +259,8 @@ class CameraMonitor:
             return estimate
         if estimate.status == "recovered":  # the person may be elsewhere, as after a cut
             self._plausibility.forget()
-        reason = self._plausibility.judge(index, estimate.joints, offset)
-        if reason is None and offset is not None and estimate.status == "recovered" and self._excess > self._accepted:
+        reason = self._plausibility.judge(index, estimate.joints)
+        if reason is None and estimate.status == "recovered" and self._excess > self._accepted:
             reason = "after a loss its residual is still high"
             self._refused = self._refused + 1
         if reason is None:
@@ -345,13 +329,6 @@ class CameraMonitor:
         self._spans = {key: (span[0], span[1], span[2]) for key, span in spans.items()}
         self._lost = {key: (span[0], span[1], span[2]) for key, span in lost.items()}
         self._opening_reasons = {int(camera): reason for camera, reason in reasons.items()}
-
-
-def _offset(residual: Float) -> Float:
-    """Return (C,) the smaller of missing and surplus area (C, 2), as a share of the larger region, mask or body. A
-    shifted mask has both; a torn mask has only missing area."""
-    missing, surplus = residual.T
-    return np.asarray(np.minimum(missing, surplus) / np.maximum(1.0 + missing - surplus, 1.0))
 
 
 def _count(spans: dict[str, Span], key: str, index: int) -> None:

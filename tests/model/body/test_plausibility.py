@@ -12,7 +12,6 @@ from tk.model.body.plausibility import Plausibility, check_extent, check_stature
 from tk.model.body.skeleton import build_skeleton
 
 SKELETON = build_skeleton(BodyDimensions.from_stature(1.75), "z")
-FINE = np.array([0.1, 0.12, np.nan])
 
 
 def joints(x: float = 0.0, z: float = 0.95, yaw_deg: float = 0.0, phase: float = 0.0) -> np.ndarray:
@@ -23,44 +22,36 @@ def joints(x: float = 0.0, z: float = 0.95, yaw_deg: float = 0.0, phase: float =
 
 
 def test_walking_turning_jumping_and_sprinting_are_possible() -> None:
-    judge = Plausibility("z", 15.0)
+    judge = Plausibility(15.0)
     for i in range(30):
         height = 0.95 + 0.5 * max(0.0, np.sin(i / 3))
-        assert judge.judge(i, joints(0.5 * i, height, 40.0 * i, i / 10), FINE) is None, i
+        assert judge.judge(i, joints(0.5 * i, height, 40.0 * i, i / 10)) is None, i
 
 
 @pytest.mark.parametrize(
-    ("then", "error", "reason"),
-    [
-        (joints(x=3.0), FINE, "jumps"),
-        (joints(yaw_deg=180.0), FINE, "turns round"),
-        (joints(z=2.4), FINE, "hovers"),
-        (joints(), np.array([0.1, 0.9, 0.1]), "one view"),
-        (joints() * np.nan, FINE, "no numbers"),
-    ],
-    ids=["a jump", "back to front", "in the air", "a view without the body", "NaN"],
+    ("then", "reason"), [(joints(x=3.0), "jumps"), (joints() * np.nan, "no numbers")], ids=["a jump", "NaN"]
 )
-def test_impossible_pose_has_a_reason(then: np.ndarray, error: np.ndarray, reason: str) -> None:
-    judge = Plausibility("z", 15.0)
-    assert judge.judge(0, joints(), FINE) is None
-    told = judge.judge(1, then, error)
+def test_impossible_pose_has_a_reason(then: np.ndarray, reason: str) -> None:
+    judge = Plausibility(15.0)
+    assert judge.judge(0, joints()) is None
+    told = judge.judge(1, then)
     assert told is not None and reason in told
-    assert judge.judge(2, joints(), FINE) is None, "it was the estimate that was wrong, not what came before"
+    assert judge.judge(2, joints()) is None, "it was the estimate that was wrong, not what came before"
 
 
 def test_after_a_loss_the_person_may_be_anywhere() -> None:
-    judge = Plausibility("-y", 60.0)
-    judge.judge(0, joints(), None)
+    judge = Plausibility(60.0)
+    judge.judge(0, joints())
     judge.forget()
-    assert judge.judge(1, joints(x=5.0, yaw_deg=180.0), None) is None
+    assert judge.judge(1, joints(x=5.0)) is None
 
 
 def test_state_is_restored() -> None:
-    judge, again = Plausibility("z", 15.0), Plausibility("z", 15.0)
-    judge.judge(4, joints(), FINE)
+    judge, again = Plausibility(15.0), Plausibility(15.0)
+    judge.judge(4, joints())
     again.restore(judge.state())
-    for told in (joints(x=3.0), joints(z=2.4), joints(x=0.1)):
-        assert again.judge(5, told, FINE) == judge.judge(5, told, FINE)
+    for told in (joints(x=3.0), joints(x=0.1)):
+        assert again.judge(5, told) == judge.judge(5, told)
 
 
 def test_impossible_sizes_are_refused() -> None:

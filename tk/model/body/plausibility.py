@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
-from tk.model.body.joints import ANKLE_JOINTS, HIPS, SHOULDERS
-from tk.model.body.skeleton import JOINTS, up_rotation
+from tk.model.body.skeleton import JOINTS
 
 Float = NDArray[np.float64]
 
@@ -25,20 +24,9 @@ STATURE_M = (1.0, 2.3)
 EXTENT = (0.55, 1.5)
 # Highest speed of the trunk, m/s: a sprinter reaches 12; and an error of its position between frames, metres.
 FASTEST_M_S, TRUNK_ERROR_M = 12.0, 0.2
-# Fastest turn, degrees a second: a pirouette has three turns a second (1080); turns below 90° between frames are
-# always accepted.
-FASTEST_TURN_DEG_S = 1500.0
-# How far the lower ankle may rise above its lowest position, metres: the best jumps are below one metre.
-HIGHEST_M = 1.2
-# Offset of a view's mask from the body, as a share of the person, above which the mask shows something else: half
-# of the body is outside the mask.
-MOST_OFFSET = 0.5
 
 _CAUSES = "the unit or the scale of calibration.toml is wrong, or the masks show more or less than the person"
-_PELVIS, _NECK = JOINTS.index("pelvis"), JOINTS.index("neck")
-_HIPS = tuple(map(JOINTS.index, HIPS))
-_SHOULDERS = tuple(map(JOINTS.index, SHOULDERS))
-_ANKLES = tuple(map(JOINTS.index, ANKLE_JOINTS))
+_TRUNK = JOINTS.index("pelvis"), JOINTS.index("neck")
 
 
 def fits_height(extent_m: float, height_m: float) -> bool:
@@ -77,66 +65,24 @@ def check_stature(stature_m: float) -> None:
 
 
 class Plausibility:
-    """Checks the poses of consecutive frames.
+    """Checks the poses of consecutive frames, at ``fps`` frames per second."""
 
-    Args:
-        up: upward direction of the world.
-        fps: frames per second.
-    """
-
-    def __init__(self, up: str, fps: float) -> None:
-        self._up = up_rotation(up)[:, 2]
+    def __init__(self, fps: float) -> None:
         self._fps = fps
         self._joints: Float | None = None  # of the last accepted frame
         self._index = -1
-        self._lowest = np.inf
 
-    def judge(self, index: int, joints: Float, offset: Float | None) -> str | None:
-        """Return why a pose is impossible; None if it is possible.
-
-        Args:
-            index: frame index.
-            joints: (J, 3) metres.
-            offset: (C,) the smaller of missing and surplus area of each used camera, as a share of the person; NaN for
-                other cameras. None if not measured.
-        """
-        reason = self._reason(index, joints, offset)
-        if reason is None:
-            self._joints, self._index = joints, index
-            self._lowest = min(self._lowest, self._height(joints))
-        return reason
-
-    def _reason(self, index: int, joints: Float, offset: Float | None) -> str | None:
+    def judge(self, index: int, joints: Float) -> str | None:
+        """Return why the joints (J, 3), metres, of a frame are impossible; None if they are possible."""
         if not np.isfinite(joints).all():
             return "it has joints that are no numbers"
-        if offset is not None and np.nanmax(offset, initial=0.0) > MOST_OFFSET:
-            return "one view shows something else than the body"
-        if self._height(joints) - self._lowest > HIGHEST_M:
-            return "it hovers above where it stood"
-        if self._joints is None:
-            return None
-        dt = max(index - self._index, 1) / self._fps
-        middle = (_PELVIS, _NECK)
-        moved = float(np.linalg.norm(joints[middle, :] - self._joints[middle, :], axis=1).min())
-        if moved > FASTEST_M_S * dt + TRUNK_ERROR_M:
-            return "it jumps"
-        turned = self._turned_deg(joints)
-        if turned > max(FASTEST_TURN_DEG_S * dt, 90.0):
-            return "it turns round at once"
+        if self._joints is not None:
+            dt = max(index - self._index, 1) / self._fps
+            moved = float(np.linalg.norm(joints[_TRUNK, :] - self._joints[_TRUNK, :], axis=1).min())
+            if moved > FASTEST_M_S * dt + TRUNK_ERROR_M:
+                return "it jumps"
+        self._joints, self._index = joints, index
         return None
-
-    def _height(self, joints: Float) -> float:
-        return float((joints[_ANKLES, :] @ self._up).min())
-
-    def _turned_deg(self, joints: Float) -> float:
-        """Return the smaller of the angles by which the lines through the hips and the shoulders have turned."""
-        assert self._joints is not None
-        angles = []
-        for left, right in (_HIPS, _SHOULDERS):
-            a, b = joints[left] - joints[right], self._joints[left] - self._joints[right]
-            cosine = a @ b / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-9)
-            angles.append(float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))))
-        return min(angles)
 
     def forget(self) -> None:
         """Forget the last pose, after a loss."""
@@ -144,11 +90,9 @@ class Plausibility:
 
     def state(self) -> Mapping[str, Any]:
         """Return what :meth:`restore` needs."""
-        known = {} if self._joints is None else {"joints": self._joints, "index": self._index}
-        return {**known, "lowest": self._lowest}
+        return {} if self._joints is None else {"joints": self._joints, "index": self._index}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state."""
         self._joints = np.asarray(state["joints"], np.float64) if "joints" in state else None
         self._index = int(state.get("index", -1))
-        self._lowest = float(state["lowest"])
