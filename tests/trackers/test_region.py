@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -22,6 +23,7 @@ from tk.model.setup import InitPose, Subject
 from tk.settings import RegionSettings, SilhouetteSettings
 from tk.trackers.region import UNKNOWN_AFTER, RegionTracker
 from tk.trackers.residual import LEAST_SPREAD
+from tk.trackers.second_pass import second_of_two
 
 RIG = ring_of_cameras(3, width=160, height=200)
 SKELETON = BODY.skeleton
@@ -398,11 +400,37 @@ def test_sigma_is_large_if_two_poses_have_similar_costs() -> None:
     tracker, wrist = tracker_at(POSES[0]), JOINTS.index("wrist_l")
 
     def sigma(masks: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        return tracker.second_pass(masks, poses, np.zeros(3, bool), np.zeros((3, 3, 2)), None, True)[2][:2, wrist]
+        return tracker.second_pass(masks, poses, np.zeros(3, bool), np.zeros((3, 3, 2)), None, True)[2][:, wrist]
 
-    there = draw_silhouettes(BODY, RIG, raised[:1])[0]
-    assert (sigma(np.array([half, half, there]), np.concatenate([hanging[:2], raised[2:]])) > 0.1).all()
+    one, other = draw_silhouettes(BODY, RIG, np.array([hanging[0], raised[0]]))
+    found = sigma(np.array([one, half, other]), np.concatenate([hanging[:2], raised[2:]]))
+    assert (found > 0.1).tolist() == [False, True, False]
     assert (sigma(np.array([half, half, half]), hanging) < 0.05).all()
+
+
+def test_second_pass_finds_legs_that_were_exchanged_in_most_frames() -> None:
+    tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=1 / 3))
+    legs = pairs(tracker.limbs)[1]
+    first = np.array([exchanged(pose, *legs) for pose in POSES[:4]] + list(POSES[4:]))
+    masks = draw_silhouettes(BODY, RIG, POSES)
+    poses, _, sigma = tracker.second_pass(masks, first, np.zeros(6, bool), np.zeros((6, 3, 2)), None, True)
+    moved = [joint for leg in legs for joint in leg.joints]
+    off = np.linalg.norm(SKELETON.joints(poses) - SKELETON.joints(POSES), axis=-1)[:, moved]
+    before = np.linalg.norm(SKELETON.joints(first) - SKELETON.joints(POSES), axis=-1)[:, moved]
+    assert before[:4].mean() > 0.15 and off.max() < 0.06 and np.isfinite(sigma).all()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_probability_of_two_states_is_that_of_all_paths(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    cost, steps = rng.normal(scale=2.0, size=6), rng.exponential(size=(2, 2, 5))
+    paths = np.array(list(itertools.product((0, 1), repeat=6)))
+    logs = -(paths * cost).sum(axis=1) - steps[paths[:, :-1], paths[:, 1:], np.arange(5)].sum(axis=1)
+    weight = np.exp(logs) / np.exp(logs).sum()
+    np.testing.assert_allclose(second_of_two(cost, steps), weight @ paths, rtol=1e-9)
+    # a cost of thousands is no overflow
+    found = second_of_two(np.array([1e4, -1e4]), np.zeros((2, 2, 1)))
+    np.testing.assert_allclose(found, [0.0, 1.0], atol=1e-100)
 
 
 def test_second_pass_keeps_a_given_body() -> None:

@@ -425,8 +425,8 @@ class RegionTracker(ContourTracker):
         again = SecondPass(self, masks, self.world.poses_in(poses), lost, residual, report)
         if self.contours.adapt and not keep_body:
             again.fit_body(height_m)
-        again.optimise()
-        again.track_backwards()
+        again.optimise(again.tracked)
+        again.decide()
         return np.where(lost[:, None], poses, self.world.poses_out(again.poses)), again.residual, again.sigma
 
     def _nobody(self, frame: Observation, watch: Stopwatch) -> Estimate:
