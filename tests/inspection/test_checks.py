@@ -18,6 +18,7 @@ from tests.io.conftest import write_picture
 from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tk.errors import CaptureError
+from tk.inspection.checks import best_shift
 from tk.inspection.leveling import Leveling, find_up, write_up
 from tk.io.captures.capture import open_capture
 from tk.model.body import gait_poses as gait
@@ -111,6 +112,17 @@ def test_delay_of_a_video_is_found_in_frames(tk: Tk, tmp_path: Path) -> None:
     ran = tk("inspect", tmp_path, "--json")
     assert ran.code == 0, ran.err
     assert [c["late_frames"] for c in json.loads(ran.out)["cameras"]] == [0, 0, late, 0]
+
+
+def test_delay_is_certain_only_if_no_single_frame_decides_it() -> None:
+    area = np.full((3, 5), 100.0)
+    late = np.tile([30.0, 20.0, 10.0, 1.0, 10.0], (3, 1))
+    assert best_shift(late, area) == (1, pytest.approx(0.09), True)
+    # two frames show no delay, the third one a large one
+    one = np.array([[9.0, 5.0, 4.0, 5.0, 9.0], [9.0, 5.0, 4.0, 5.0, 9.0], [90.0, 80.0, 70.0, 9.0, 60.0]])
+    assert best_shift(one, area) == (1, pytest.approx((78 - 19) / 300), False)
+    assert best_shift(np.ones((3, 5)), area) == (0, 0.0, True)
+    assert best_shift(np.zeros((3, 5)), np.zeros((3, 5))) == (0, 0.0, True)
 
 
 def test_time_offset_is_a_note_and_no_problem(tk: Tk, copy: Path) -> None:

@@ -37,8 +37,7 @@ Masks = NDArray[np.uint8]
 
 # These values decide which findings are printed, and no tracking result depends on them. With half and twice each value
 # the findings on walk, fold, rig9, pair and treadmill-slow are the same, except for specks in the ragged masks of
-# treadmill-slow (half the value names two cameras more, twice the value one fewer), and for the delay of its cam1,
-# which cuts the person off in 80 % of the frames: 0 to 2 frames, now 1.
+# treadmill-slow (half the value names two cameras more, twice the value one fewer).
 #: frames that are compared; frames whose neighbours are also compared, and number of neighbours before and after: the
 #: largest delay that is found
 _FRAMES, _DELAY_FRAMES, _LARGEST_DELAY = 10, 5, 5
@@ -220,7 +219,13 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
             # the others are people, not what a turned camera shows of one person
             masks, agreement = own, alone
     chosen = [masks[int(i)] for i in frames]
-    late = _delays(compare, masks, centers, agreement)
+    late, sure = _delays(compare, masks, centers, agreement)
+    for c in () if sure else np.flatnonzero(late).tolist():
+        notes.append(
+            f"camera {capture.rig[c].name} may start {_frames(late[c])}, but without some of the compared frames its "
+            "masks say otherwise: it cannot be decided"
+        )
+        late[c] = 0
     hulls = compare.hulls([compare.possible(m) for m in chosen])
     good = agreement.right
     points = [hull.points(good) for hull in hulls if hull is not None]
@@ -254,29 +259,44 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
 
 def _delays(
     compare: MaskAgreement, masks: dict[int, Masks], centers: Sequence[int], agreement: Agreement
-) -> NDArray[np.int64]:
-    """Return the delay of each camera (C,) frames: the shift with which its masks lie in the hull of the others."""
+) -> tuple[NDArray[np.int64], bool]:
+    """Return the delay of each camera (C,) frames, the shift with which its masks lie in the hull of the others; and
+    whether it is certain: the same without any one of the frames (jackknife)."""
     C = len(compare.rig)
     small = {index: compare.small(m) for index, m in masks.items()}
     hulls = compare.hulls([compare.possible(masks[i]) for i in centers])
     shifts = np.arange(-_LARGEST_DELAY, _LARGEST_DELAY + 1)
     late = np.zeros(C, np.int64)
-    out = np.zeros((C, len(shifts)))
-    for c in range(C):
-        others = [k for k in agreement.right if k != c]
-        out[c] = _outside_by_shift(small, centers, hulls, others, c, shifts)
-    best = shifts[np.nanargmin(np.where(np.isfinite(out), out, np.inf), axis=1)]
-    now = out[:, _LARGEST_DELAY]
-    least = np.nanmin(np.where(np.isfinite(out), out, np.inf), axis=1)
-    candidates = np.flatnonzero((best != 0) & (now > _DELAY_LEAST) & (least < _DELAY_GAIN * now))
+    found = [
+        best_shift(*_areas_by_shift(small, centers, hulls, [k for k in agreement.right if k != c], c, shifts))
+        for c in range(C)
+    ]
     # a delayed camera also spoils the hulls for the others; the delayed one gains most from a shift
-    if len(candidates):
-        c = int(candidates[np.argmax((now - least)[candidates])])
-        late[c] = -best[c]
-    return late
+    c = int(np.argmax([gain for _, gain, _ in found]))
+    late[c] = -found[c][0]
+    return late, found[c][2]
 
 
-def _outside_by_shift(
+def best_shift(outside: NDArray[np.float64], area: NDArray[np.float64]) -> tuple[int, float, bool]:
+    """Return the shift that moves a camera's masks into the hull of the others, frames; by how much the share outside
+    falls; and whether the shift is the same without any one of the frames (jackknife). 0, 0.0 if none does.
+
+    Args:
+        outside, area: (N, S) area outside the hull and whole area, of N frames and shifts from -S // 2 to S // 2.
+    """
+    total = np.array([outside, area])
+    result = _lowest(*total.sum(axis=1))
+    return *result, all(_lowest(*np.delete(total, k, axis=1).sum(axis=1))[0] == result[0] for k in range(len(area)))
+
+
+def _lowest(outside: NDArray[np.float64], area: NDArray[np.float64]) -> tuple[int, float]:
+    share = np.where(area > 0, outside / np.maximum(area, 1), np.inf)
+    best, middle = int(np.argmin(share)), len(share) // 2
+    now, least = float(share[middle]), float(share[best])
+    return (best - middle, now - least) if _DELAY_LEAST < now < np.inf and least < _DELAY_GAIN * now else (0, 0.0)
+
+
+def _areas_by_shift(
     small: dict[int, NDArray[np.bool_]],
     centers: Sequence[int],
     hulls: Sequence[Hull | None],
@@ -284,18 +304,18 @@ def _outside_by_shift(
     camera: int,
     shifts: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """Return the share (S,) of a camera's masks outside the others' hull, for masks taken so many frames later."""
-    area, out = np.zeros(len(shifts)), np.zeros(len(shifts))
-    for center, hull in zip(centers, hulls, strict=True):
+    """Return (2, N, S) the area of a camera's masks outside the others' hull and their whole area, in N frames, for
+    masks taken S shifts later."""
+    areas = np.zeros((2, len(centers), len(shifts)))
+    for n, (center, hull) in enumerate(zip(centers, hulls, strict=True)):
         # all shifts or none, so that they are compared over the same frames
         if hull is None or any(center + int(s) not in small for s in shifts):
             continue
         silhouette = hull.silhouette(hull.carve(others), camera)
         for i, s in enumerate(shifts):
             mask = small[center + int(s)][camera]
-            area[i] += mask.sum()
-            out[i] += np.count_nonzero(mask & ~silhouette)
-    return np.where(area > 0, out / np.maximum(area, 1), np.nan)
+            areas[:, n, i] = np.count_nonzero(mask & ~silhouette), mask.sum()
+    return areas
 
 
 def _silhouettes(hull: Hull | None, good: Sequence[int]) -> NDArray[np.bool_] | None:
@@ -327,8 +347,8 @@ def _camera(
         verdict = "its image is blank, or frozen while the others move"
     elif late:
         verdict = (
-            f"its video seems to start {abs(late)} frame(s) {'late' if late > 0 else 'early'}: its frame "
-            f"{max(-late, 0)} shows what frame {max(late, 0)} of the others shows"
+            f"its video seems to start {_frames(late)}: its frame {max(-late, 0)} shows what frame "
+            f"{max(late, 0)} of the others shows"
         )
     elif c in agreement.wrong:
         verdict = agreement.reason(c)
@@ -345,6 +365,10 @@ def _camera(
         bad_images=bad_images,
         verdict=verdict,
     )
+
+
+def _frames(late: int) -> str:
+    return f"{abs(late)} frame(s) {'late' if late > 0 else 'early'}"
 
 
 def _findings(found: Inspection, capture: Capture, agreement: Agreement) -> list[str]:
