@@ -24,7 +24,7 @@ from tk.io.results.reader import read_result
 from tk.io.results.status import Status
 from tk.model.cameras.volume import Volume
 from tk.model.setup import Setup, Subject
-from tk.run import offline
+from tk.run import offline, session
 from tk.run.choice import Choice
 from tk.run.people import Member, People
 from tk.run.session import estimates, track_source
@@ -121,21 +121,25 @@ def test_frames_before_the_first_person_are_absent_and_the_others_as_if_tracking
     assert np.isfinite(result.joints).all()
 
 
-def test_a_run_that_was_interrupted_after_the_first_person_came_is_resumed(tmp_path: Path) -> None:
-    class Stopped(Rendered):
-        def frames(self, start: int = 0, stop: int | None = None) -> AbstractContextManager[Iterator[FrameSet]]:
-            def interrupted() -> Iterator[FrameSet]:
-                with super(Stopped, self).frames(start, stop) as frames:
-                    yield from frames
+@pytest.mark.parametrize("stop", [EMPTY - 2, EMPTY + 1])
+def test_a_run_that_began_with_an_empty_volume_is_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int
+) -> None:
+    class Stop(Silent):
+        def advance(self, frame: int, estimate: object) -> None:
+            if frame == stop:
                 raise KeyboardInterrupt
 
-            return nullcontext(interrupted())
-
+    monkeypatch.setattr(session, "WRITE_EVERY_S", 0)
     whole, part = tmp_path / "whole.h5", tmp_path / "part.h5"
     track_source(SETUP, LATE, whole, SETTINGS, Silent())
-    for source, resume in ((Stopped(LATE.masks[: EMPTY + 2]), False), (LATE, True)):
-        track_source(SETUP, source, part, SETTINGS, Silent(), resume=resume)
-    np.testing.assert_array_equal(read_result(part).pose, read_result(whole).pose)
+    stopped = track_source(SETUP, LATE, part, SETTINGS, Stop())
+    # frames are in the file from the first person on; before, there is none
+    assert (stopped.interrupted, stopped.frames) == (True, stop + 1 if stop >= EMPTY else 0)
+    assert part.exists() == (stop >= EMPTY) and len(list(tmp_path.iterdir())) == (3 if part.exists() else 1)
+    track_source(SETUP, LATE, part, SETTINGS, Silent(), resume=True)
+    for name in ("pose", "status", "sigma"):
+        np.testing.assert_array_equal(getattr(read_result(part), name), getattr(read_result(whole), name))
 
 
 def test_nobody_in_any_frame_is_an_error_that_leaves_no_file(tmp_path: Path) -> None:
