@@ -216,24 +216,28 @@ class People:
         self._tracked += [self._member(k, subject, self._make()) for k, subject in enumerate(known[1:], 1)]
         rest = [person for n, person in enumerate(found) if n not in numbers and person.views.sum() >= 2]
         shares = self._shares([*people, *rest], opening)
-        refusal = opening_agreement(self._setup, opening).refusal
         for member, frames, person in zip(self._tracked, shares, people, strict=False):
-            self._begin(member, frames, person.height_m, refusal)
+            self._begin(member, frames, person.height_m, opening)
         for person, frames in zip(rest, shares[len(people) :], strict=True):
             if person.inside:
                 self._admit(frames, person, unknown(subjects[0]), written=False)
 
     def _begin(
-        self, member: Member, frames: Sequence[Observation], hull_m: float | None, refusal: str | None = None
+        self, member: Member, frames: Sequence[Observation], hull_m: float | None, whole: Sequence[Observation] = ()
     ) -> None:
-        """Start a tracker. ``hull_m``: height of the visual hull in the first frame. ``refusal``: why the whole masks
-        contradict each other, which counts if those of the person alone cannot be compared: cameras that do not belong
-        together show several people where one is."""
-        subject = member.subject
+        """Start a tracker.
+
+        Args:
+            member: the person.
+            frames: the person's share of the opening.
+            hull_m: height of the visual hull in the first frame.
+            whole: the opening with everybody's masks. They are compared if those of the person alone cannot be:
+                cameras that do not belong together show several people where one is.
+        """
         seen = member.monitor.start(frames)
-        if refusal and not member.monitor.tested:
+        if whole and not member.monitor.tested and (refusal := opening_agreement(self._setup, whole).refusal):
             raise CaptureError(refusal)
-        member.tracker.start(seen, replace(subject, hull_m=hull_m))
+        member.tracker.start(seen, replace(member.subject, hull_m=hull_m))
         member.monitor.check_body()
 
     @property
