@@ -23,6 +23,7 @@ from tk.io.captures.mask_store import MaskStore
 from tk.io.results.reader import read_result
 from tk.io.results.status import Status
 from tk.io.toml import load_toml
+from tk.kernels.mask_values import OTHERS
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
@@ -152,6 +153,20 @@ def test_videos_that_are_late_by_more_than_edges_reach_are_found(late: list[int]
     tracked = TrackedPoses(frames, poses, seen.any(axis=(2, 3)).all(axis=1))
     found = whole_delays(body, rig, seen.__getitem__, tracked)
     assert found.tolist() == late
+
+
+def test_an_excluded_camera_is_not_late() -> None:
+    """From some frame on it shows the person in few pixels only, and the body covers many times as many others."""
+    rig, body = ring_of_cameras(4, 160, 120), build_cone_body(BodyDimensions.from_stature(1.75))
+    frames = np.arange(40)
+    poses = np.array([gait.walking_pose(body.skeleton, i / 12 % 1) for i in frames])
+    poses[:, :3] = np.column_stack([0.03 * frames - 0.6, 0 * frames, 0 * frames + 0.95])
+    seen = draw_silhouettes(body, rig, poses)
+    aside = np.roll(seen[24:, 1], 50, axis=2)  # the camera is turned
+    seen[24:, 1] = np.where(aside > 0, OTHERS, 0)
+    seen[24:, 1, 50:54, 70:74] = 255
+    found = whole_delays(body, rig, seen.__getitem__, TrackedPoses(frames, poses, np.ones(40, np.bool_)))
+    assert found.tolist() == [0, 0, 0, 0]
 
 
 def test_masks_of_late_cameras_come_from_other_frames() -> None:

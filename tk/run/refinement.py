@@ -53,6 +53,8 @@ _UNKNOWN_FRAMES = 0.25
 # first factor, and falls below the second without the delay. Two frames late at 15 Hz gave no delay without this.
 LARGEST_DELAY, DELAY_FRAMES = 5, 12
 _WORSE, _MENDED = 1.3, 0.8
+# Least share of wrong pixels that is compared, a tenth of what correct cameras have: drawn masks have none.
+_EXACT = 0.01
 
 
 @dataclass(frozen=True)
@@ -244,12 +246,11 @@ def whole_delays(
 ) -> NDArray[np.int64]:
     """Return (C,) whole frames by which each video is late. The body explains the masks of a late video worse than
     those of the others, and those of some frames earlier well. Arguments as of :func:`refine_rig`."""
-    late = np.zeros(len(rig), np.int64)
-    frames, known = tracked.frames, set(tracked.frames.tolist())
+    frames, stored = tracked.frames, set(tracked.frames.tolist())
     shifts = range(-LARGEST_DELAY, LARGEST_DELAY + 1)
-    rows = np.flatnonzero(tracked.usable & [all(frame - n in known for n in shifts) for frame in frames.tolist()])
+    rows = np.flatnonzero(tracked.usable & [all(frame - n in stored for n in shifts) for frame in frames.tolist()])
     if not len(rows):
-        return late
+        return np.zeros(len(rig), np.int64)
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, DELAY_FRAMES).round().astype(int))]
     grid = RayGrid(rig, SCREEN_ROWS)
     sampled = cache(lambda frame: grid.sample(masks(frame)).copy())
@@ -258,26 +259,21 @@ def whole_delays(
         _, met = Evidence.of(grid, masks(int(frames[i]))).cast(body, tracked.poses[i][None])
         bodies.append(met.label[0] > 0)
 
-    def wrong(n: int, cameras: NDArray[np.intp]) -> Float:
-        """Return (R, N) the shares of wrong pixels of N cameras with masks of n frames before; NaN where they show
-        nobody."""
-        shown = [sampled(int(frames[i]) - n)[cameras] for i in rows]
-        both = zip(bodies, shown, strict=True)
-        return np.array([residual_of(drawn[cameras], m >= 128, m == OTHERS).sum(axis=1) for drawn, m in both])
+    def wrong(n: int) -> Float:
+        """Return (R, C) the shares of wrong pixels with masks of n frames before; NaN where they show nobody."""
+        both = zip(bodies, (sampled(int(frames[i]) - n) for i in rows), strict=True)
+        return np.array([residual_of(drawn, m >= 128, m == OTHERS).sum(axis=1) for drawn, m in both])
 
-    def mean(shares: Float) -> Float:
-        """Return (..., N) means over the frames in which shares (..., R, N) are known for every delay; 0 without."""
-        known = np.isfinite(shares).reshape(-1, *shares.shape[-2:]).all(axis=0)
-        return np.asarray(np.where(known, shares, 0.0).sum(axis=-2) / np.maximum(known.sum(axis=0), 1))
-
-    now = mean(wrong(0, np.arange(len(rig))))
-    suspects = np.flatnonzero(now > _WORSE * np.median(now))
-    if not len(suspects):
-        return late
-    errors = mean(np.array([wrong(n, suspects) for n in shifts]))
-    best = np.argmin(errors, axis=0)
-    late[suspects] = np.where(errors.min(axis=0) < _MENDED * errors[LARGEST_DELAY], np.array(shifts)[best], 0)
-    return late
+    # frames in which a camera shows somebody with every delay
+    shares = np.array([wrong(n) for n in shifts])
+    shares = np.ma.array(shares, mask=np.broadcast_to(~np.isfinite(shares).all(axis=0), shares.shape))
+    now = np.ma.maximum(shares[LARGEST_DELAY], _EXACT)
+    # A delay mends most frames. A camera that is turned at some time has frames of its old place within the largest
+    # delay after the turn, but in the frames before, every delay is worse.
+    change = np.ma.filled(np.ma.median(shares / now, axis=1), 1.0)
+    mean = np.ma.filled(now.mean(axis=0), 0.0)
+    mended = (mean > _WORSE * np.median(mean)) & (change.min(axis=0) < _MENDED)
+    return np.where(mended, np.array(shifts)[np.argmin(change, axis=0)], 0)
 
 
 def retimed(store: MaskStore, frames: NDArray[np.int64], late: NDArray[np.int64]) -> MaskStore:
