@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import scipy.ndimage
 
 from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
@@ -15,7 +14,7 @@ from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume
-from tk.model.people import LocatedPerson, PeopleFinder, components, order_people
+from tk.model.people import LocatedPerson, PeopleFinder, order_people
 
 RIG = ring_of_cameras(5, 240, 240)
 VOLUME = Volume((0.0, 0.0, 1.0), (2.4, 2.4, 2.2))
@@ -90,7 +89,7 @@ def test_people_are_the_same_if_all_voxels_are_looked_at(bend: float, monkeypatc
     finder = PeopleFinder(rig, VOLUME, "z")
     some = finder.find(masks, uncertain)
     points, _ = finder.around(np.array([0.8, 0.9, 0.9]), 255 * masks.astype(np.uint8))
-    monkeypatch.setattr("tk.model.people._touched", lambda mask, center, radius: np.ones(len(center), np.bool_))
+    monkeypatch.setattr("tk.model.hull.voxel_table._touched", lambda mask, center, radius: np.ones(len(center), np.bool_))
     every = PeopleFinder(rig, VOLUME, "z").find(masks, uncertain)
     assert len(some) == len(every) > 0
     for a, b in zip(some, every, strict=True):
@@ -194,9 +193,3 @@ def test_numbers_follow_height_then_views_then_distance_to_the_centre() -> None:
     assert first(position=np.array([-0.6, 0.0, 0.9])) < 0
     fewer = [replace(p, views=p.views & (np.arange(5) > 0)) if p.position[0] > 0 else p for p in found]
     assert order_people(fewer, VOLUME)[0].position[0] < 0
-
-
-@pytest.mark.parametrize("share", [0.0, 0.2, 0.35, 0.6])
-def test_components_are_numbered_as_by_scipy(share: float) -> None:
-    shown = np.random.default_rng(3).random((12, 9, 11)) < share
-    np.testing.assert_array_equal(components(shown), scipy.ndimage.label(shown)[0])

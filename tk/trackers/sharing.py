@@ -60,7 +60,7 @@ class PixelOwners:
     """The owner of each pixel of a frame."""
 
     grid: RayGrid  # cells of the images, one ray each
-    # (V, H, W) the number of a person, `NOBODY` for somebody unknown, or `UNCLEAR`; without meaning outside the masks
+    # (V, H, W) the number of a person, or `NOBODY` for somebody unknown; without meaning outside the masks
     owner: NDArray[np.int8]
     people: int  # number of people, also those whose body is unknown
 
