@@ -89,7 +89,8 @@ def test_people_are_the_same_if_all_voxels_are_looked_at(bend: float, monkeypatc
     finder = PeopleFinder(rig, VOLUME, "z")
     some = finder.find(masks, uncertain)
     points, _ = finder.around(np.array([0.8, 0.9, 0.9]), 255 * masks.astype(np.uint8))
-    monkeypatch.setattr("tk.model.hull.voxel_table._touched", lambda mask, center, radius: np.ones(len(center), np.bool_))
+    touched = "tk.model.hull.voxel_table._touched"
+    monkeypatch.setattr(touched, lambda mask, center, radius: np.ones(len(center), np.bool_))
     every = PeopleFinder(rig, VOLUME, "z").find(masks, uncertain)
     assert len(some) == len(every) > 0
     for a, b in zip(some, every, strict=True):

@@ -368,7 +368,7 @@ def _camera(
 
 
 def _frames(late: int) -> str:
-    return f"{abs(late)} frame(s) {'late' if late > 0 else 'early'}"
+    return f"{abs(late)} frame{'s' if abs(late) > 1 else ''} {'late' if late > 0 else 'early'}"
 
 
 def _findings(found: Inspection, capture: Capture, agreement: Agreement) -> list[str]:

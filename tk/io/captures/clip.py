@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -42,7 +43,7 @@ class Reader(Protocol):
 
 
 @dataclass(frozen=True)
-class Clip:
+class Clip(ABC):
     """A sequence of images on disk."""
 
     path: Path  # the file or folder, as messages name it
@@ -54,9 +55,9 @@ class Clip:
     times_s: NDArray[np.float64] | None = field(default=None, compare=False)
     recorded_size: tuple[int, int] | None = None  # width and height in the files, if the clip is reduced
 
+    @abstractmethod
     def open(self) -> Reader:
         """Return a reader at the first image."""
-        raise NotImplementedError
 
     def shown(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the number of the image that each frame shows, the nearest before the start and after the end; -1 if
