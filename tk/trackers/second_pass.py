@@ -172,17 +172,20 @@ class SecondPass:
             if i != last + step:
                 continue
             here, poses = skeleton.joints(present), np.repeat(present[None], len(alternatives), axis=0)
-            pyramid = self._pyramid(i, LEVEL + 1)
             for one, pose, near, tracked in zip(alternatives, poses, result[:, last], np.isfinite(known), strict=True):
                 if tracked or not one.legs:
                     pose[one.dofs] = near[one.dofs]
                 elif every and i % every == 0:
                     pose[:] = exchanged(present, *one.legs)
-                if skeleton.apart(pose, here) > SAME_POSE_M:
-                    start = pose[None].copy()
-                    prior = tracker.prior(start, ANGLE_DEG)
-                    pose[:] = tracker.settle(pyramid, start, (LEVEL,), prior=prior, limb=one.limb).states[0]
             differ = np.flatnonzero(skeleton.apart(poses, here) > SAME_POSE_M)
+            if not len(differ):
+                continue
+            pyramid = self._pyramid(i, LEVEL + 1)
+            for k in differ.tolist():
+                start = poses[k][None].copy()
+                prior = tracker.prior(start, ANGLE_DEG)
+                poses[k] = tracker.settle(pyramid, start, (LEVEL,), prior=prior, limb=alternatives[k].limb).states[0]
+            differ = differ[skeleton.apart(poses[differ], here) > SAME_POSE_M]
             if not len(differ):
                 continue
             costs = self._costs(pyramid, np.concatenate([present[None], poses[differ]]))
