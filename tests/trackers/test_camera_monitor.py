@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -176,6 +177,20 @@ def test_camera_with_torn_mask_is_excluded_until_its_masks_are_whole(scene: Scen
     assert monitor.report() == ["camera cam2 misses a part of the person: left out of frames 2 to 10"]
     assert not any(e.status == "lost" for e in estimates)
     assert scene.error(estimates, range(FRAMES)) < 0.05
+
+
+@pytest.mark.parametrize("camera", [1, 2, 3])
+def test_mask_with_surplus_area_is_left_out_if_the_others_fit_better_without_it(scene: Scene, camera: int) -> None:
+    def too_wide(frame: Observation) -> Observation:
+        masks = frame.masks.copy()
+        if frame.index >= 4:
+            masks[camera] = cv2.dilate(masks[camera], np.ones((9, 9), np.uint8))
+        return replace(frame, masks=masks)
+
+    monitor, estimates, used = scene.follow(too_wide)
+    assert [bool(u[camera]) for u in used] == [True] * 4 + [False] * (FRAMES - 4)
+    assert monitor.report() == [f"camera cam{camera + 1} disagrees with the others: left out of frames 4 to 13"]
+    assert scene.error(estimates, range(FRAMES)) < 0.035
 
 
 @pytest.mark.parametrize("part", [(0.0, 0.2), (0.7, 1.0)], ids=["the head", "the shanks"])

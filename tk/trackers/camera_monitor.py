@@ -201,7 +201,7 @@ class CameraMonitor:
             tracker.rewind(before)
             second = tracker.step(fewer)
             residual = self._residual(frame, second)
-            if self._is_wrong(worst, residual, others, second.joints):
+            if self._is_wrong(worst, residual, error, others, second.joints):
                 self._excluded[worst] = True
                 self._torn[worst] = residual[worst, 1] < _TORN * residual[worst, 0]
                 estimate, used, kept = replace(second, status=first.status), fewer, others
@@ -213,21 +213,28 @@ class CameraMonitor:
         self._excluded &= ~back
         return estimate, used
 
-    def _is_wrong(self, camera: int, residual: Float, others: NDArray[np.bool_], joints: Float) -> bool:
+    def _is_wrong(self, camera: int, residual: Float, before: Float, others: NDArray[np.bool_], joints: Float) -> bool:
         """Return whether a camera is wrong, by the joints (J, 3) and the residual (C, 2) of the pose without it.
 
         Cameras that see the person from the same or from opposite sides contradict no other camera, because they do not
         determine a pose. If the other cameras have a high residual too, the pose is wrong instead. Surplus area alone,
-        such as a second person in the mask, hardly misleads contours: it does not count.
+        such as a second person in the mask, hardly misleads contours: it counts only if the others' E_S falls without
+        the camera, from ``before`` (C,), by one spread. A pose from two cameras is uncertain, so a third must have
+        twice the excess.
         """
         assert isinstance(self.tracker, RegionTracker)
         rays = joints.mean(axis=0) - self._setup.rig.centers[others]
         if depth_information(rays / np.linalg.norm(rays, axis=1, keepdims=True)) < LEAST_INFORMATION:
             return False
         baseline, error = self.tracker.residuals, residual.sum(axis=1)
-        if baseline.mean_excess(np.where(others, error, np.nan)) > baseline.threshold:
+        excess_of_others = baseline.mean_excess(np.where(others, error, np.nan))
+        if excess_of_others > baseline.threshold:
             return False
-        return bool(baseline.excess(residual[:, 0])[camera] > OUTLIER or error[camera] > _UNRELATED)
+        many = others.sum() >= 3
+        missing = baseline.excess(residual[:, 0])[camera] > (OUTLIER if many else 2 * OUTLIER)
+        relief = baseline.mean_excess(np.where(others, before, np.nan)) - excess_of_others
+        surplus = many and baseline.excess(error)[camera] > OUTLIER and relief > 1.0
+        return bool(missing or surplus or error[camera] > _UNRELATED)
 
     def _residual(self, frame: Observation, estimate: Estimate) -> Float:
         """Return (C, 2) missing and surplus area at the estimate's pose, of excluded cameras, too. Missing area on
