@@ -13,7 +13,8 @@ import open3d as o3d
 
 import tk
 from tk.model.cameras.volume import VoxelGrid
-from tk.run.segmentation import make_segmenter
+from tk.run.segmentation import make_labeller
+from tk.run.task import Task
 
 DEMO = Path(tk.__file__).parent / "data" / "demo"
 
@@ -27,15 +28,13 @@ options = parser.parse_args()
 options.out.mkdir(parents=True, exist_ok=True)
 
 capture = tk.open_capture(options.capture)
-segment = make_segmenter(
-    capture.setup(), capture, tk.Settings(), print
-)  # its masks, or those made against the empty scene
+label = make_labeller(Task.of(capture, tk.Settings()), print)  # its masks, or those made against the empty scene
 grid = VoxelGrid.cover(capture.volume, options.voxels)
 hull = tk.VisualHull(capture.rig, grid)
 
 with capture.frames(0, options.frames) as frames:
     for frame in frames:
-        hull.update(segment(frame))
+        hull.update(label(frame).masks)
         surface = hull.surface(frame.images)  # voxels on the surface, with normals, and colours from the cameras
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(surface.positions.astype(float)))
         cloud.normals = o3d.utility.Vector3dVector(surface.normals.astype(float))

@@ -26,6 +26,7 @@ from tk.io.results.reader import read_joints
 from tk.model.cues.objective import BARRED
 from tk.model.setup import Subject
 from tk.run.segmentation import make_labeller
+from tk.run.task import Task
 from tk.settings import Settings
 from tk.trackers.protocol import Observation
 from tk.trackers.volumetric import VolumetricTracker
@@ -54,7 +55,7 @@ class Recorded:
 
     def __init__(self, path: Path) -> None:
         self.capture: Capture = open_capture(path, None, "none")
-        label = make_labeller(self.capture.setup(), self.capture, Settings(), lambda _: None)
+        label = make_labeller(Task.of(self.capture, Settings()), lambda _: None)
         with self.capture.frames() as frames:
             self.frames = [
                 Observation(frame.index, np.array(frame.images), *(np.array(layer) for layer in label(frame)[:2]))

@@ -26,7 +26,7 @@ from tk.io.results.reader import read_joints, read_result
 from tk.io.results.status import Status
 from tk.run.reporter import Silent
 from tk.run.session import track
-from tk.settings import Settings
+from tk.run.task import RecordingOptions
 
 FROM = 22
 """The development captures show the initialisation pose for 10 frames and leave it in the next 12."""
@@ -65,7 +65,8 @@ def compare(capture: Capture, begin: int, work: Path, names: Sequence[str]) -> I
             continue
         reporter = Quiet()
         output = work / f"{capture.name}-{name.replace(', ', '-').replace(' ', '-')}.h5"
-        track(started, output, Settings(), reporter, frames=(0 if name == "normal" else begin, None), force=True)
+        options = RecordingOptions(frames=(0 if name == "normal" else begin, None))
+        track(started, output, options, reporter, force=True)
         result = read_result(output)
         kept = result.frames >= begin
         expected = truth.positions[[rows[int(frame)] for frame in result.frames[kept]]]

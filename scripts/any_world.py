@@ -31,7 +31,7 @@ from tk.model.cameras.tracker_frame import seen_from
 from tk.model.cameras.up import up_text
 from tk.model.cameras.volume import Volume
 from tk.run.session import track
-from tk.settings import Settings
+from tk.run.task import RecordingOptions
 
 Float = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ def turned(capture: Capture, turn: Float, shift: Float, up: bool = True) -> Capt
 def run(capture: Capture, frames: tuple[int, int | None], work: Path) -> tuple[Result, list[str]]:
     """Track the capture; return the result and the notes."""
     reporter = Quiet()
-    track(capture, work / "r.h5", Settings(), reporter, frames=frames, force=True)
+    track(capture, work / "r.h5", RecordingOptions(frames=frames), reporter, force=True)
     return read_result(work / "r.h5"), reporter.notes
 
 

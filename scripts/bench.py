@@ -64,7 +64,8 @@ from tk.model.cues.objective import CHAIN_SAMPLES, COVERAGE_VOXELS, BodyObjectiv
 from tk.model.hull.hull import VisualHull
 from tk.run import session
 from tk.run.reporter import Silent
-from tk.run.segmentation import make_segmenter
+from tk.run.segmentation import make_labeller
+from tk.run.task import RecordingOptions, Task
 from tk.settings import Settings
 from tk.trackers.bodies import body_and_poses
 from tk.trackers.protocol import Estimate
@@ -176,11 +177,8 @@ def run_once(options: Options, output: Path) -> Run:
         summary = session.track(
             options.open(),
             output,
-            options.config,
+            RecordingOptions(options.config, options.method, frames=(0, options.frames), init_pose=options.init_pose),
             clock,
-            frames=(0, options.frames),
-            init_pose=options.init_pose,
-            method=options.method,
             force=True,
         )
     seconds = time.perf_counter() - started
@@ -243,10 +241,10 @@ def stages_alone(options: Options, result: Result) -> tuple[list[Stage], bench_h
     first = max(stop - WINDOW, int(result.frames[0]))
     with capture.frames(first, stop) as reader:
         frames = list(reader)
-    segment = make_segmenter(capture.setup(), capture, config, lambda _: None)
-    masks = [segment(frame) for frame in frames]
+    label = make_labeller(Task.of(capture, config), lambda _: None)
+    masks = [label(frame).masks for frame in frames]
     decoding = Stage("decode", _decode_ms(capture, first, stop, options.repeat), {})
-    masking = Stage("masks", statistics.median(median_ms(partial(segment, frame), 1) for frame in frames), {})
+    masking = Stage("masks", statistics.median(median_ms(partial(label, frame), 1) for frame in frames), {})
     if options.method == SilhouetteTracker.method:
         return [decoding, masking, *silhouette_stages(capture, frames, masks, result)], None
     masked = bench_hull.MaskedCapture(capture.name, capture.rig, capture.volume, np.stack(masks))

@@ -14,8 +14,9 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from tk.batch import Outcome, TrackOptions, run_batch
+from tk.batch import Outcome, run_batch
 from tk.batch.jobs import DONE
+from tk.run.task import RecordingOptions
 
 DEMO = Path(__file__).resolve().parents[1] / "tk" / "data" / "demo"
 
@@ -41,7 +42,7 @@ def measure(capture: Path, copies: int, frames: int, workers: int) -> tuple[int,
             for item in capture.resolve().iterdir():
                 (take / item.name).symlink_to(item)
         started = time.perf_counter()
-        outcomes = run_batch(takes, Path(scratch) / "out", TrackOptions(frames=(0, frames)), _Quiet(), workers)
+        outcomes = run_batch(takes, Path(scratch) / "out", RecordingOptions(frames=(0, frames)), _Quiet(), workers)
         return sum(outcome.frames for outcome in outcomes.values()), time.perf_counter() - started
 
 

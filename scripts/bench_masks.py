@@ -22,6 +22,7 @@ import numpy as np
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.captures.clip import MASK_THRESHOLD
 from tk.run.segmentation import make_labeller
+from tk.run.task import Task
 from tk.settings import Settings
 
 TIMED = 40
@@ -49,7 +50,7 @@ def truth_of(folder: Path, capture: Capture, index: int) -> np.ndarray:
 def measure(path: Path, frames: int | None) -> str:
     """The line of one capture."""
     capture = open_capture(path, masks="none")
-    label = make_labeller(capture.setup(), capture, Settings(), print)
+    label = make_labeller(Task.of(capture, Settings()), print)
     label(next(capture.frames(0, 1)))  # compiles
     stop = min(frames or capture.frame_count, capture.frame_count)
     with capture.frames(0, stop) as reader:

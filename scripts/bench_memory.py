@@ -31,7 +31,7 @@ from tk.render.video import video_writer
 from tk.report.after import write_video_and_report
 from tk.run import session
 from tk.run.reporter import Silent
-from tk.settings import Settings
+from tk.run.task import RecordingOptions
 from tk.trackers.protocol import Estimate
 
 DEMO = Path(__file__).resolve().parents[1] / "tk" / "data" / "demo"
@@ -133,7 +133,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         log.addHandler(report)
         log.setLevel(logging.INFO)
         begun = time.perf_counter()
-        done = session.track(capture, Path(scratch) / "loop.h5", Settings(), report, causal=chosen.causal)
+        done = session.track(capture, Path(scratch) / "loop.h5", RecordingOptions(causal=chosen.causal), report)
         log.removeHandler(report)
         print(
             f"{done.frames} frames in {done.seconds:.0f} s, {done.lost} lost; at the end {held_mib():.1f} MiB, at most "

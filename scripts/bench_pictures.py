@@ -14,7 +14,7 @@ from tk.io.captures.capture import open_capture
 from tk.report.after import write_video_and_report
 from tk.run import session
 from tk.run.reporter import Silent
-from tk.settings import Settings
+from tk.run.task import RecordingOptions
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def run_once(capture_path: Path, masks: str, frames: int | None, output: Path) -
     """A default run and its pictures; meant for a process of its own."""
     started = _clocks()
     capture = open_capture(capture_path, masks=masks)
-    summary = session.track(capture, output, Settings(), Silent(), frames=(0, frames))
+    summary = session.track(capture, output, RecordingOptions(frames=(0, frames)), Silent())
     tracked = _clocks()
     warnings: list[str] = []
     write_video_and_report(capture, output, warnings.append)

@@ -15,7 +15,7 @@ from tk.io.captures.capture import open_capture
 from tk.io.results.reader import read_result
 from tk.run import session
 from tk.run.reporter import Silent
-from tk.settings import Settings
+from tk.run.task import RecordingOptions
 from tk.trackers.protocol import Estimate
 
 
@@ -67,7 +67,7 @@ def run_once(folder: Path, masks: str, output: Path, causal: bool) -> Speed:
     opened = time.perf_counter()
     capture = open_capture(folder, masks=masks)
     clock = _Clock()
-    session.track(capture, output, Settings(), clock, causal=causal, force=True)
+    session.track(capture, output, RecordingOptions(causal=causal), clock, force=True)
     ended = time.perf_counter()
     with capture.frames() as reader:
         started = time.perf_counter()

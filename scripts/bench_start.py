@@ -43,13 +43,14 @@ def pieces(path: str, masks: str) -> None:
     from tk.kernels.runtime import ensure_runtime, ti
     from tk.model.people import PeopleFinder
     from tk.run.people import People
-    from tk.run.plan import open_plan, recording_setup, reduce_images
-    from tk.settings import Settings
+    from tk.run.plan import open_plan, recording_task
+    from tk.run.task import RecordingOptions
     from tk.threads import one_thread
     from tk.trackers import contour_tracker
 
     recording = tk.io.importers.open_recording(Path(path), None, masks)
-    setup, recording = reduce_images(recording_setup(recording, None, None, 0), recording, Settings().person_pixels)
+    task = recording_task(recording, RecordingOptions())
+    setup = task.setup
     done("opening the recording")
     ensure_runtime()
     done("starting Taichi")
@@ -66,7 +67,7 @@ def pieces(path: str, masks: str) -> None:
         return run
 
     kernel = ti.lang.kernel_impl.Kernel
-    with open_plan(setup, recording, Settings(), lambda _: None, "region", (0, None)) as plan:
+    with open_plan(task, lambda _: None) as plan:
         done("tracker, without its kernels")
         frames = plan.observations.frames(plan.first, plan.stop)
         with mock.patch.object(kernel, "materialize", timed("transformation of kernels", kernel.materialize)):
@@ -80,7 +81,7 @@ def pieces(path: str, masks: str) -> None:
         with one_thread():
             PeopleFinder(setup.rig, setup.volume, setup.up).find(opening[0].masks, opening[0].uncertain)
             done("finding people")
-            people = People(plan.setup, plan.tracker, plan.another_tracker, "auto", lambda _: None)
+            people = People(task, plan.tracker, lambda _: None)
             find, fit = contour_tracker.find_person, contour_tracker.fit_body
             with (
                 mock.patch.object(contour_tracker, "find_person", timed("search for the pose", find)),

@@ -20,6 +20,7 @@ from tk.io.captures.capture import Capture
 from tk.io.toml import load_toml
 from tk.model.cameras.camera import Camera
 from tk.run.segmentation import make_labeller
+from tk.run.task import Task
 from tk.settings import Settings
 
 Image = NDArray[np.uint8]
@@ -115,9 +116,8 @@ class Faulty:
 
     def masks(self) -> NDArray[np.uint8]:
         """Return (F, C, H, W) masks against the empty scene."""
-        original = self.original
-        label = make_labeller(original.setup(), original, Settings(), lambda _: None)
-        with original.frames() as frames:
+        label = make_labeller(Task.of(self.original, Settings()), lambda _: None)
+        with self.original.frames() as frames:
             return np.array([label(frame)[0] for frame in frames])
 
     def give_masks(self, edit: Callable[[int, NDArray[np.uint8]], NDArray[np.uint8]]) -> None:

@@ -386,12 +386,14 @@ def make_base(folder: Path) -> Base:
     from tk.io.captures.capture import open_capture
     from tk.run.reporter import Silent
     from tk.run.session import track
+    from tk.run.task import RecordingOptions
 
     capture = folder / "base"
     write_capture(plan_capture(Options(frames=6, cameras=4, size=(96, 72), seed=3)), capture, masks=True)
     settings = settings_file.from_toml(SETTINGS)
     # a causal result can be resumed
-    track(open_capture(capture), folder / "base.h5", settings, Silent(), frames=(0, 4), causal=True)
+    options = RecordingOptions(settings, frames=(0, 4), causal=True)
+    track(open_capture(capture), folder / "base.h5", options, Silent())
     return Base(capture, folder / "base.h5")
 
 

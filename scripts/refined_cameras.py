@@ -31,6 +31,7 @@ from tk.io.results.reader import read_joints, read_result
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.refinement import aligned, turn_between
 from tk.run.session import track
+from tk.run.task import RecordingOptions
 from tk.settings import Settings
 
 TURN_DEG, MOVE_M = 0.25, 0.010
@@ -71,7 +72,7 @@ def compare(capture: Path, seeds: int, late: bool, masks: str, work: Path) -> It
         opened, errors = open_capture(folder, masks=masks), []
         for refine in (False, True):
             output = work / f"{folder.name}-{refine}.h5"
-            track(opened, output, Settings(refine=refine), Quiet(), force=True)
+            track(opened, output, RecordingOptions(Settings(refine=refine)), Quiet(), force=True)
             result = read_result(output)
             found = evaluate(read_joints(output), truth)
             errors.append(f"{found.raw.all.mean_cm:.2f} {found.corrected.limbs.mean_cm:.2f}")

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import hypothesis
 import pytest
@@ -23,7 +23,12 @@ from scripts.synthetic.capture import Options, plan_capture, write_capture
 from tk.errors import TkError
 from tk.io import settings_file
 from tk.io.captures.capture import Capture
-from tk.model.setup import Setup
+from tk.run.reporter import Reporter
+from tk.run.task import RecordingOptions
+from tk.settings import Settings
+
+if TYPE_CHECKING:
+    from tk.run.session import Summary
 
 # every run uses the same examples, and none fails because the machine is slow; `pytest --hypothesis-profile default`
 # draws new ones
@@ -72,9 +77,19 @@ init_frames = 3
 """
 
 
-def setup_and_source(capture: Capture) -> tuple[Setup, Capture]:
-    """Return the two things that a recording gives."""
-    return capture.setup(), capture
+def track(
+    capture: Capture,
+    output: Path,
+    settings: Settings,
+    reporter: Reporter | None = None,
+    resume: bool = False,
+    force: bool = False,
+    **options: Any,
+) -> Summary:
+    """Track a recording; ``options`` are those of :class:`tk.run.task.RecordingOptions`."""
+    from tk.run import session
+
+    return session.track(capture, output, RecordingOptions(settings, **options), reporter or Silent(), resume, force)
 
 
 @dataclass(frozen=True)
@@ -166,10 +181,9 @@ def copy(tiny: Path, tmp_path: Path) -> Path:
 def tracked(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The result, read-only, of an uninterrupted run of the volumetric tracker over the rendered capture."""
     from tk.io.captures.capture import open_capture
-    from tk.run.session import track
 
     def make(path: Path) -> None:
-        track(open_capture(tiny), path, settings_file.from_toml(QUICK), Silent(), method="volumetric", store_hull=True)
+        track(open_capture(tiny), path, settings_file.from_toml(QUICK), method="volumetric", store_hull=True)
 
     return made_once(tmp_path_factory, "unbroken.h5", make)
 

@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.conftest import Silent, Tk, development_capture
+from tests.conftest import Tk, development_capture, track
 from tk.evaluation.joints import Evaluation, evaluate_files
 from tk.io.captures.capture import open_capture
 from tk.io.results.reader import read_result
-from tk.run.session import track
 from tk.settings import Settings
 
 pytestmark = pytest.mark.slow
@@ -48,7 +47,7 @@ def test_mean_error_of_captures_segmented_from_their_videos(name: str, tmp_path:
     means = []
     for seed in range(SEEDS):
         result = tmp_path / f"{seed}.h5"
-        track(open_capture(folder, masks="none"), result, Settings(seed=seed), Silent())
+        track(open_capture(folder, masks="none"), result, Settings(seed=seed))
         found = evaluate_files(result, folder / "truth.h5")
         assert_complete(found, FRAMES[name])
         means.append(found.raw.all.mean_cm)
@@ -60,7 +59,7 @@ def test_runs_with_the_same_seed_give_the_same_poses(name: str, tmp_path: Path) 
     capture = open_capture(development_capture(name), masks="none")
     poses = []
     for run in ("a.h5", "b.h5"):
-        track(capture, tmp_path / run, Settings(), Silent(), frames=(0, 30))
+        track(capture, tmp_path / run, Settings(), frames=(0, 30))
         poses.append(read_result(tmp_path / run).pose)
     assert len(poses[0]) == 30
     np.testing.assert_array_equal(poses[0], poses[1])

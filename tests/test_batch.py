@@ -17,8 +17,8 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.conftest import QUICK, Silent, Tk
-from tk.batch import Job, Outcome, TrackOptions, exit_code
+from tests.conftest import QUICK, Tk, track
+from tk.batch import Job, Outcome, exit_code
 from tk.batch.jobs import DONE, FAILED, make_jobs
 from tk.batch.run import _finished
 from tk.batch.summary import write_summary
@@ -29,7 +29,7 @@ from tk.io.captures.capture import open_capture
 from tk.io.hdf5_writer import Hdf5Writer
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.skeleton import JOINTS, build_skeleton
-from tk.run.session import track
+from tk.run.task import RecordingOptions
 
 ROOT = Path(__file__).parents[1]
 CONFIG = settings_file.from_toml(QUICK)
@@ -48,35 +48,35 @@ def test_captures_get_unique_names_and_keep_them(tmp_path: Path) -> None:
     out = tmp_path / "out"
     (out / "jobs").mkdir(parents=True)
     ann, bob, low = folders(tmp_path / "ann" / "walk", tmp_path / "bob" / "walk", tmp_path / "bob" / "WALK")
-    jobs = make_jobs([ann, bob, low], out, TrackOptions())
+    jobs = make_jobs([ann, bob, low], out, RecordingOptions())
     assert [job.name for job in jobs[:2]] == ["walk", "bob_walk"]
     assert len({job.name.lower() for job in jobs}) == 3
     for job in jobs:
         job.write(Outcome(DONE, frames=3))
     # another order, and a part of them: the names stay
-    assert [job.name for job in make_jobs([bob, ann], out, TrackOptions())] == [jobs[1].name, jobs[0].name]
+    assert [job.name for job in make_jobs([bob, ann], out, RecordingOptions())] == [jobs[1].name, jobs[0].name]
 
 
 def test_duplicate_captures_and_foreign_results_are_refused(tmp_path: Path) -> None:
     walk, out = folders(tmp_path / "walk", tmp_path / "out")
     with pytest.raises(ConfigError, match="walk: is given twice"):
-        make_jobs([walk, tmp_path / "out" / ".." / "walk"], out, TrackOptions())
+        make_jobs([walk, tmp_path / "out" / ".." / "walk"], out, RecordingOptions())
     (out / "walk.h5").write_text("mine")
     with pytest.raises(ResultError, match=r"walk\.h5: exists, but not from tk batch"):
-        make_jobs([walk], out, TrackOptions())
+        make_jobs([walk], out, RecordingOptions())
 
 
 def test_records_are_read_back_and_other_options_are_refused(tmp_path: Path) -> None:
     walk, out = folders(tmp_path / "walk", tmp_path / "out" / "jobs")
-    (job,) = make_jobs([walk], out.parent, TrackOptions())
+    (job,) = make_jobs([walk], out.parent, RecordingOptions())
     assert job.read() == Outcome()
     outcome = Outcome(DONE, 14, 2, 1, 10, 1.5, 2.0, None, 0.05, 1.2, ("a note",))
     job.write(outcome)
     assert job.read() == outcome
-    (other,) = make_jobs([walk], out.parent, TrackOptions(method="silhouette"))
+    (other,) = make_jobs([walk], out.parent, RecordingOptions(method="silhouette"))
     with pytest.raises(ResultError, match=r"made with method region, not silhouette; choose another folder"):
         other.read()
-    (tuned,) = make_jobs([walk], out.parent, TrackOptions(config=CONFIG))
+    (tuned,) = make_jobs([walk], out.parent, RecordingOptions(CONFIG))
     with pytest.raises(ResultError, match="made with settings"):
         tuned.read()
 
@@ -86,8 +86,8 @@ def test_damaged_records_are_refused(tmp_path: Path, text: str) -> None:
     walk, records = folders(tmp_path / "walk", tmp_path / "out" / "jobs")
     (records / "walk.json").write_text(text)
     with pytest.raises(ResultError):
-        make_jobs([walk], tmp_path / "out", TrackOptions())[0].read()
-        Job("walk", walk, tmp_path / "out", TrackOptions()).read()
+        make_jobs([walk], tmp_path / "out", RecordingOptions())[0].read()
+        Job("walk", walk, tmp_path / "out", RecordingOptions()).read()
 
 
 # --- the summary ------------------------------------------------------------------------------------------------------
@@ -96,7 +96,7 @@ def test_damaged_records_are_refused(tmp_path: Path, text: str) -> None:
 def test_summary_lists_all_outcomes(tmp_path: Path) -> None:
     odd = tmp_path / "a <b> & c"
     captures = folders(odd, tmp_path / "two", tmp_path / "three", tmp_path / "out" / "jobs")[:3]
-    jobs = make_jobs(captures, tmp_path / "out", TrackOptions())
+    jobs = make_jobs(captures, tmp_path / "out", RecordingOptions())
     outcomes = dict(
         zip(
             [job.name for job in jobs],
@@ -189,7 +189,7 @@ class _Notes:
 
 def test_death_of_a_worker_is_reported(tmp_path: Path) -> None:
     """A capture that begins for the second time had another worker before."""
-    (job,) = make_jobs(folders(tmp_path / "walk"), tmp_path / "out", TrackOptions())
+    (job,) = make_jobs(folders(tmp_path / "walk"), tmp_path / "out", RecordingOptions())
     progress = [(0, True), (7, False), (5, True), (9, False)]
     messages = [{"name": "walk", "done": done, "total": 9, "begins": begins} for done, begins in progress]
     reporter = _Notes()
@@ -199,7 +199,7 @@ def test_death_of_a_worker_is_reported(tmp_path: Path) -> None:
 
 def test_error_without_offsets_is_not_given_for_a_still_person(tmp_path: Path) -> None:
     capture, out = folders(tmp_path / "walk", tmp_path / "out")
-    (job,) = make_jobs([capture], out, TrackOptions())
+    (job,) = make_jobs([capture], out, RecordingOptions())
     still = build_skeleton(BodyDimensions.from_stature(1.75)).joints(np.zeros(31))
     bent = still + 0.0
     bent[[JOINTS.index(f"{name}_l") for name in ("elbow", "wrist", "knee", "ankle")], 0] += 0.3
@@ -242,7 +242,7 @@ def test_failure_of_a_capture_has_the_hint(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr("tk.io.importers.open_recording", refuse)
     (tmp_path / "jobs").mkdir()
-    outcome = work(Job("rec", tmp_path / "rec", tmp_path, TrackOptions()))
+    outcome = work(Job("rec", tmp_path / "rec", tmp_path, RecordingOptions()))
     assert outcome.failure == "rec: is a Pose2Sim project; tk import rec -o CAPTURE"
 
 
@@ -368,7 +368,7 @@ def test_killed_worker_and_scheduler_lose_nothing_and_repeat_nothing(
         assert ((out / f"{name}.h5").read_bytes(), records()[name]) == (content, record)
     assert "calibration.toml: there is no such file" in records()["broken"]["failure"]
     unbroken = tmp_path / "unbroken.h5"
-    track(open_capture(captures[0]), unbroken, CONFIG, Silent())
+    track(open_capture(captures[0]), unbroken, CONFIG)
     for capture in captures:
         record = records()[capture.name]
         assert (record["state"], record["frames"], record["lost"], record["trace"]) == (DONE, frames, 0, "")

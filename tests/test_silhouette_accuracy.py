@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from scripts.silhouette_tables import CAMERAS, OURS, load, track
-from tests.conftest import Silent, development_capture
+from tests.conftest import development_capture
+from tests.conftest import track as track_capture
 from tk.io.captures.capture import open_capture
 from tk.io.results.reader import read_joints
-from tk.run.session import track as track_capture
 from tk.settings import Settings
 
 pytestmark = pytest.mark.slow
@@ -28,7 +28,7 @@ def test_four_views_of_the_treadmill_are_as_accurate_as_the_paper() -> None:
 def test_silhouette_tracker_on_masks_from_the_video(name: str, most_cm: float, tmp_path: Path) -> None:
     folder = development_capture(name)
     capture = open_capture(folder, masks="none")
-    summary = track_capture(capture, tmp_path / "r.h5", Settings(), Silent(), method="silhouette")
+    summary = track_capture(capture, tmp_path / "r.h5", Settings(), method="silhouette")
     truth = read_joints(folder / "truth.h5")
     found = read_joints(tmp_path / "r.h5")
     assert summary.lost == 0

@@ -15,9 +15,9 @@ from tk.io.importers import open_recording
 from tk.io.results.data import Result
 from tk.io.results.reader import read_result
 from tk.run import session
-from tk.run.choice import parse_choice
-from tk.run.plan import recording_setup, reduce_images
+from tk.run.plan import recording_task
 from tk.run.reporter import Silent
+from tk.run.task import RecordingOptions, parse_choice
 from tk.segmenters import Segmenter
 from tk.settings import Settings
 from tk.trackers.protocol import Estimate
@@ -123,39 +123,28 @@ def track(
             before it is in the file.
         KeyboardInterrupt: the user stopped the run; with ``output`` the finished frames are in the file.
     """
-    chosen = config or Settings()
+    settings = config or Settings()
     if seed is not None:
-        chosen = replace(chosen, seed=seed)
-    pose_file = Path(init_pose) if init_pose is not None else None
-    body_file = Path(body) if body is not None else None
-    choice = parse_choice(people if isinstance(people, str) else ",".join(map(str, people)))
+        settings = replace(settings, seed=seed)
+    options = RecordingOptions(
+        settings,
+        method,
+        frames,
+        parse_choice(people if isinstance(people, str) else ",".join(map(str, people))),
+        causal,
+        init_pose=Path(init_pose) if init_pose is not None else None,
+        body=Path(body) if body is not None else None,
+    )
     if not isinstance(capture, Capture):
-        capture = open_capture(capture, resample=chosen.resample)
+        capture = open_capture(capture, resample=settings.resample)
     if segmenter is not None:
         capture = replace(capture, segmenter=segmenter)
     reporter = _Logged()
     if output is None:
         if resume or force:
             raise ConfigError("resume and force need an output file")
-        setup = recording_setup(capture, pose_file, body_file, frames[0])
-        setup, capture = reduce_images(setup, capture, chosen.person_pixels)
-        for warning in capture.warnings:
-            reporter.note(warning)
-        return session.estimates(setup, capture, chosen, reporter.note, method, frames, choice)
-    summary = session.track(
-        capture,
-        Path(output),
-        chosen,
-        reporter,
-        method,
-        frames,
-        pose_file,
-        resume,
-        body=body_file,
-        causal=causal,
-        force=force,
-        people=choice,
-    )
+        return session.estimates(recording_task(capture, options), reporter.note)
+    summary = session.track(capture, Path(output), options, reporter, resume, force)
     if summary.interrupted:
         raise KeyboardInterrupt
     return read_result(Path(output))

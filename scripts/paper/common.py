@@ -18,6 +18,7 @@ from tk.io.results.reader import read_joints
 from tk.model.body.skeleton import JOINTS
 from tk.run import session
 from tk.run.reporter import Silent
+from tk.run.task import RecordingOptions
 from tk.settings import Settings
 
 matplotlib.use("Agg")
@@ -101,7 +102,7 @@ def track(
     truth = read_joints(capture / "truth.h5")
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "result.h5"
-        session.track(open_capture(capture, cameras), out, config, Silent(), method, (0, frames))
+        session.track(open_capture(capture, cameras), out, RecordingOptions(config, method, (0, frames)), Silent())
         result = read_joints(out)
         with h5py.File(out) as file:
             pose, units = file["pose"][:], tuple(file["pose"].attrs["units"])

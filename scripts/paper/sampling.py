@@ -23,7 +23,8 @@ from tk.model.cues.objective import CHAIN_NAMES, BodyObjective, FrameObjective
 from tk.model.setup import Subject
 from tk.optim import schedule as s
 from tk.optim import smd
-from tk.run.segmentation import make_segmenter
+from tk.run.segmentation import make_labeller
+from tk.run.task import Task
 from tk.settings import Settings
 from tk.trackers.protocol import Observation
 from tk.trackers.volumetric import CELL_VOXELS, VolumetricTracker
@@ -62,11 +63,11 @@ def look(options: Options, paper: Settings) -> Scene:
     """Track to the last of the frames with the defaults, and set up ``paper``'s objective there."""
     capture = open_capture(options.capture)
     config = Settings()
-    segment = make_segmenter(capture.setup(), capture, config, lambda _: None)
+    label = make_labeller(Task.of(capture, config), lambda _: None)
     tracker = VolumetricTracker(capture.rig, capture.volume, capture.up, config)
     opening = tracker.opening_frames
     with capture.frames(0, options.frames) as frames:
-        seen = (Observation(f.index, f.images.copy(), segment(f).copy()) for f in frames)
+        seen = (Observation(f.index, f.images.copy(), label(f).masks.copy()) for f in frames)
         first = list(islice(seen, opening))
         tracker.start(first, Subject(capture.subject_height_m))
         for observation in (*first, *seen):

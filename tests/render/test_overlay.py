@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.conftest import QUICK, Silent, Tk
+from tests.conftest import QUICK, Tk, track
 from tests.made_results import write_motion
 from tests.model.figures import draw_silhouettes
 from tk.errors import ResultError
@@ -30,7 +30,6 @@ from tk.render.canvas import View, dots, draw_body, draw_joints
 from tk.render.figure import Figure, Seen, solids_of
 from tk.render.overlay import Grid, Overlay, write_sheets
 from tk.render.palette import BONE, LOST, LOST_BODY, SEGMENT_COLORS, person_color, sigma_colors
-from tk.run.session import track
 from tk.trackers.bodies import body_and_poses
 
 DEMO = Path(__file__).resolve().parents[2] / "tk" / "data" / "demo"
@@ -99,7 +98,7 @@ def test_outlines_of_cones_are_their_silhouette() -> None:
 
 def test_results_of_the_region_tracker_are_drawn(tiny: Path, tmp_path: Path) -> None:
     path = tmp_path / "region.h5"
-    track(open_capture(tiny), path, settings_file.from_toml(QUICK), Silent(), frames=(0, 2))
+    track(open_capture(tiny), path, settings_file.from_toml(QUICK), frames=(0, 2))
     capture = open_capture(tiny, masks="none")
     (sheet,) = write_sheets(Overlay(capture, read_result(path)), tmp_path, [1], full=True)
     picture = cv2.imread(str(sheet))

@@ -18,6 +18,7 @@ from tk.io.captures.capture import Capture, open_capture
 from tk.io.captures.frames import FrameSet
 from tk.run.learned_masks import LEARNED, LEARNED_AND_SEGMENTER, SEGMENTER
 from tk.run.segmentation import Labels, make_labeller
+from tk.run.task import Task
 from tk.settings import Settings
 
 FRAMES = 60
@@ -50,7 +51,7 @@ def capture_of(folder: Path) -> tuple[Capture, Counting]:
 
 
 def labels_of(capture: Capture, start: int = 0) -> list[Labels]:
-    label = make_labeller(capture.setup(), capture, Settings(), lambda _: None)
+    label = make_labeller(Task.of(capture, Settings()), lambda _: None)
     with capture.frames(start) as frames:
         return [Labels(*(np.array(layer) for layer in label(frame))) for frame in frames]
 
@@ -73,12 +74,12 @@ def test_a_note_says_why_the_segmenter_makes_all_masks(folder: Path, monkeypatch
     capture, _ = capture_of(folder)
     said: list[str] = []
     short = replace(capture, frame_count=40)
-    make_labeller(short.setup(), short, Settings(), said.append)
+    make_labeller(Task.of(short, Settings()), said.append)
     assert "fewer than 50 frames are too few" in said[-1]
-    make_labeller(capture.setup(), capture, Settings(), said.append)
+    make_labeller(Task.of(capture, Settings()), said.append)
     assert "every frame" not in said[-1]
     monkeypatch.setattr("tk.run.learned_masks._SAMPLE_BYTES", 7 * 5 * math.prod(capture.setup().rig.frame_shape) * 4)
-    make_labeller(capture.setup(), capture, Settings(), said.append)
+    make_labeller(Task.of(capture, Settings()), said.append)
     assert "images are too large" in said[-1]
 
 
@@ -130,7 +131,7 @@ class Live:
 
 def test_source_of_unknown_length_is_learned_while_it_runs(folder: Path) -> None:
     capture, _ = capture_of(folder)
-    label = make_labeller(capture.setup(), Live(capture), Settings(), lambda _: None)  # type: ignore[arg-type]
+    label = make_labeller(Task(capture.setup(), Live(capture)), lambda _: None)  # type: ignore[arg-type]
     sources, errors = [], []
     with capture.frames() as frames:
         for frame in frames:

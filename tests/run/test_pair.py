@@ -9,7 +9,7 @@ from tests.conftest import development_capture
 from tk.io.captures.capture import open_capture
 from tk.io.results.reader import read_people
 from tk.run.session import estimates
-from tk.settings import Settings
+from tk.run.task import Task, TrackOptions
 
 FRAMES = 40  # they pass in frame 35, 0.7 m apart
 
@@ -18,7 +18,7 @@ FRAMES = 40  # they pass in frame 35, 0.7 m apart
 def test_two_people_who_pass_each_other_keep_their_numbers() -> None:
     capture = open_capture(development_capture("pair"))
     truth = read_people(capture.truth_file)
-    found = list(estimates(capture.setup(), capture, Settings(), frames=(0, FRAMES), people="all"))
+    found = list(estimates(Task(capture.setup(), capture, TrackOptions(frames=(0, FRAMES), people="all"))))
     assert [(e.frame, e.person) for e in found] == [(frame, person) for frame in range(FRAMES) for person in (0, 1)]
     assert "lost" not in {e.status for e in found}
     for person in (0, 1):

@@ -18,7 +18,8 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.conftest import FRAMES, QUICK, Silent, setup_and_source
+from tests import conftest
+from tests.conftest import FRAMES, QUICK, Silent
 from tests.people import write_people
 from tests.run.test_session import assert_same, send
 from tk.errors import ConfigError, VideoError, WorkerError
@@ -27,11 +28,12 @@ from tk.io.captures.capture import open_capture
 from tk.io.results.reader import read_result
 from tk.run import prefetch, session, worker
 from tk.run.prefetch import Ahead, Observations, Serial, open_observations
+from tk.run.task import Task
 from tk.settings import Settings
 
 AHEAD = settings_file.from_toml(QUICK.replace("ahead = 0", "ahead = 2"))
 ROOT = Path(__file__).parents[2]
-track = partial(session.track, method="volumetric")
+track = partial(conftest.track, method="volumetric")
 
 
 def arrays(source: Observations, start: int, stop: int) -> list[tuple[int, np.ndarray, np.ndarray, np.ndarray | None]]:
@@ -53,8 +55,8 @@ def nobody(text: str) -> None:
 def test_prefetched_frames_equal_direct_ones(tiny: Path, masks: str, keep_images: bool, doubts: bool) -> None:
     """Given masks are not in doubt; without pictures nobody asks for what is."""
     capture = open_capture(tiny, masks=masks)
-    theirs = arrays(Ahead(capture.setup(), capture, AHEAD, nobody, keep_images), 2, FRAMES)
-    ours = arrays(Serial(capture.setup(), capture, AHEAD, nobody, keep_images), 2, FRAMES)
+    theirs = arrays(Ahead(Task.of(capture, AHEAD), nobody, keep_images), 2, FRAMES)
+    ours = arrays(Serial(Task.of(capture, AHEAD), nobody, keep_images), 2, FRAMES)
     assert [frame[0] for frame in theirs] == list(range(2, FRAMES))
     assert ours[0][2].any() and (ours[0][1].size > 0) == keep_images
     for a, b in zip(theirs, ours, strict=True):
@@ -72,7 +74,7 @@ def test_frames_are_made_here_if_no_memory_can_be_shared(tiny: Path, monkeypatch
 
     capture, notes = open_capture(tiny), list[str]()
     monkeypatch.setattr(prefetch.os, "ftruncate", refuse)
-    with open_observations(capture.setup(), capture, AHEAD, notes.append) as observations:
+    with open_observations(Task.of(capture, AHEAD), notes.append) as observations:
         assert isinstance(observations, Serial)
     assert notes == [
         "no memory can be shared with another process (File too large): frames are made one after the other"
@@ -84,8 +86,8 @@ def test_held_frames_are_not_overwritten(tiny: Path, monkeypatch: pytest.MonkeyP
     """More of them than the ring has slots, some dropped in between, and views after their frame."""
     monkeypatch.setattr(prefetch, "_SPARE", spare)
     capture = open_capture(tiny)
-    expected = arrays(Serial(capture.setup(), capture, AHEAD, nobody), 0, FRAMES)
-    with Ahead(capture.setup(), capture, AHEAD, nobody) as source:
+    expected = arrays(Serial(Task.of(capture, AHEAD), nobody), 0, FRAMES)
+    with Ahead(Task.of(capture, AHEAD), nobody) as source:
         held = {o.index: o.masks[1:, ::2] for o, _ in source.frames(0, FRAMES) if o.index % 4 != 2}
     assert len(held) > FRAMES // 2
     for index, masks in held.items():
@@ -94,9 +96,9 @@ def test_held_frames_are_not_overwritten(tiny: Path, monkeypatch: pytest.MonkeyP
 
 def test_prefetching_does_not_change_the_result(tiny: Path, tracked: Path, tmp_path: Path) -> None:
     capture = open_capture(tiny)
-    track(capture, tmp_path / "r.h5", AHEAD, Silent(), frames=(0, 6), store_hull=True)
+    track(capture, tmp_path / "r.h5", AHEAD, frames=(0, 6), store_hull=True)
     assert_same(tmp_path / "r.h5", tracked, slice(0, 6))
-    track(capture, tmp_path / "r.h5", AHEAD, Silent(), resume=True, store_hull=True)
+    track(capture, tmp_path / "r.h5", AHEAD, resume=True, store_hull=True)
     assert_same(tmp_path / "r.h5", tracked)
     timing = read_result(tmp_path / "r.h5").timing
     work = sum(seconds for stage, seconds in timing.items() if stage not in ("decode", "masks", "total"))
@@ -106,7 +108,7 @@ def test_prefetching_does_not_change_the_result(tiny: Path, tracked: Path, tmp_p
 def test_notes_of_the_process_are_reported(tmp_path: Path) -> None:
     folder = write_people(tmp_path / "walk", [lambda k: (0.85 * np.cos(k / 2), 0.85 * np.sin(k / 2))], 12)
     notes: list[str] = []
-    assert len(arrays(Ahead(*setup_and_source(open_capture(folder, masks="median")), AHEAD, notes.append), 0, 1)) == 1
+    assert len(arrays(Ahead(Task.of(open_capture(folder, masks="median"), AHEAD), notes.append), 0, 1)) == 1
     assert "the median of 12 frames is taken for the empty scene" in notes[0]
 
 
@@ -115,21 +117,21 @@ def test_an_error_is_raised_at_its_frame(copy: Path, tmp_path: Path) -> None:
     broken = sorted((copy / "masks").iterdir())[1] / "000007.png"
     broken.write_bytes(broken.read_bytes()[:40])
     with pytest.raises(VideoError, match=r"000007\.png: is not a picture that can be decoded"):
-        track(capture, tmp_path / "r.h5", AHEAD, Silent())
+        track(capture, tmp_path / "r.h5", AHEAD)
     np.testing.assert_array_equal(read_result(tmp_path / "r.h5").frames, np.arange(7))
 
 
 def test_an_error_while_learning_the_background_is_raised(copy: Path) -> None:
     capture = open_capture(copy, masks="none")
     next((copy / "background").iterdir()).unlink()
-    with Ahead(capture.setup(), capture, AHEAD, nobody) as source, pytest.raises(VideoError, match="has no background"):
+    with Ahead(Task.of(capture, AHEAD), nobody) as source, pytest.raises(VideoError, match="has no background"):
         next(source.frames(0, 3))
 
 
 def test_a_defect_keeps_its_traceback(tiny: Path) -> None:
     no_number: Any = "3"
     with (
-        Ahead(*setup_and_source(open_capture(tiny)), AHEAD, nobody) as observations,
+        Ahead(Task.of(open_capture(tiny), AHEAD), nobody) as observations,
         pytest.raises(RuntimeError, match="TypeError") as raised,
     ):
         next(observations.frames(0, no_number))
@@ -164,13 +166,13 @@ def test_no_process_or_memory_remains(tiny: Path) -> None:
 
     capture = open_capture(tiny)
     before = open_files()
-    with Ahead(capture.setup(), capture, AHEAD, nobody) as source:
+    with Ahead(Task.of(capture, AHEAD), nobody) as source:
         frames: Iterator[object] = source.frames(0, FRAMES)
         next(frames)
         assert open_files() > before
     assert source._process.returncode == 0  # it ended by itself
     source.close()
-    with Ahead(capture.setup(), capture, AHEAD, nobody) as unused:
+    with Ahead(Task.of(capture, AHEAD), nobody) as unused:
         pass
     assert unused._process.returncode is not None
     del source, frames, unused
@@ -183,7 +185,7 @@ def test_the_process_ends_with_the_tracker(tiny: Path) -> None:
     script = (
         "import os, signal, sys, tk.run.prefetch, tk.settings, tk.io.captures.capture as c\n"
         "capture = c.open_capture(sys.argv[1])\n"
-        "source = tk.run.prefetch.Ahead(capture.setup(), capture, tk.settings.Settings(ahead=1), print)\n"
+        "source = tk.run.prefetch.Ahead(tk.run.task.Task.of(capture, tk.settings.Settings(ahead=1)), print)\n"
         "frames = source.frames(0, 14); next(frames)\n"
         "print(source._process.pid, flush=True)\n"
         "os.kill(os.getpid(), signal.SIGKILL)\n"
@@ -222,21 +224,21 @@ def test_ctrl_c_and_sigterm_of_the_command_line(tiny: Path, tmp_path: Path, numb
 
 def test_one_core_needs_no_further_process(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = open_capture(tiny)
-    assert isinstance(open_observations(capture.setup(), capture, Settings(ahead=0), nobody), Serial)
+    assert isinstance(open_observations(Task.of(capture, Settings(ahead=0)), nobody), Serial)
     monkeypatch.setattr("tk.run.worker.cores", lambda: 1)
-    assert isinstance(open_observations(capture.setup(), capture, Settings(), nobody), Serial)
+    assert isinstance(open_observations(Task.of(capture, Settings()), nobody), Serial)
     monkeypatch.setattr("tk.run.worker.cores", lambda: 2)
-    with open_observations(capture.setup(), capture, Settings(), nobody) as source:
+    with open_observations(Task.of(capture, Settings()), nobody) as source:
         assert isinstance(source, Ahead)
 
 
 def test_process_that_was_started_early_is_used_once_and_else_ended(tiny: Path) -> None:
     capture = open_capture(tiny)
-    expected = arrays(Serial(capture.setup(), capture, AHEAD, nobody), 0, 2)
+    expected = arrays(Serial(Task.of(capture, AHEAD), nobody), 0, 2)
     with worker.started_early():
         (early,) = worker._ready
         time.sleep(1.0)  # it prepares
-        with Ahead(capture.setup(), capture, AHEAD, nobody) as source:
+        with Ahead(Task.of(capture, AHEAD), nobody) as source:
             assert source._process is early.process
             found = arrays(source, 0, 2)
         assert not worker._ready
@@ -244,7 +246,7 @@ def test_process_that_was_started_early_is_used_once_and_else_ended(tiny: Path) 
         np.testing.assert_array_equal(a[2], b[2], strict=True)
     with worker.started_early():
         (early,) = worker._ready
-        assert isinstance(open_observations(capture.setup(), capture, Settings(ahead=0), nobody), Serial)
+        assert isinstance(open_observations(Task.of(capture, Settings(ahead=0)), nobody), Serial)
         assert early.process.returncode is not None
 
 

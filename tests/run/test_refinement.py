@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from tests.conftest import FRAMES, QUICK, Silent, Tk
+from tests.conftest import FRAMES, QUICK, Silent, Tk, track
 from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tk.io import settings_file
@@ -32,7 +32,6 @@ from tk.model.cameras.camera import Rig
 from tk.model.cameras.refinement import turn_between
 from tk.run import offline as finish
 from tk.run.refinement import refine_capture, retimed, whole_delays
-from tk.run.session import track
 from tk.settings import Settings
 from tk.trackers.region import UNKNOWN_AFTER
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.conftest import QUICK, Silent, Tk, setup_and_source
+from tests.conftest import QUICK, Silent, Tk
 from tests.people import install, truth, write_people
 from tk.errors import CaptureError, ConfigError
 from tk.io import settings_file
@@ -20,7 +20,8 @@ from tk.io.captures.capture import open_capture
 from tk.kernels.background import Statistic
 from tk.run.mask_folder import write_masks
 from tk.run.prefetch import Ahead, open_observations
-from tk.run.segmentation import make_segmenter, mask_source, prepare_kernels
+from tk.run.segmentation import make_labeller, mask_source, prepare_kernels
+from tk.run.task import Task
 from tk.segmenters import load, names
 from tk.segmenters.people_masks import PeopleMasks
 from tk.settings import Settings
@@ -101,10 +102,10 @@ def test_a_missing_segmenter_is_reported(walk: Path, tmp_path: Path, monkeypatch
 def test_median_background_of_a_moving_person(walk: Path) -> None:
     notes: list[str] = []
     capture = open_capture(walk, masks="median")
-    segment = make_segmenter(capture.setup(), capture, Settings(), notes.append)
+    label = make_labeller(Task.of(capture, Settings()), notes.append)
     assert notes == [f"{walk}: the median of 20 frames is taken for the empty scene"]
     with capture.frames(10, 11) as frames:
-        found = wrong(segment(next(frames)), truth(walk, 10))
+        found = wrong(label(next(frames)).masks, truth(walk, 10))
     assert np.sort(found)[-2] < 0.1, "one camera sees the bystander behind, who is of the same colour"
 
 
@@ -113,14 +114,14 @@ def test_median_background_of_a_moving_person(walk: Path) -> None:
 def test_median_background_of_a_still_person_is_refused(tmp_path: Path, masks: str) -> None:
     folder = write_people(tmp_path / "still", [standing], 12)
     with pytest.raises(CaptureError, match="hardly moves" if masks == "median" else "no segmenter") as caught:
-        make_segmenter(*setup_and_source(open_capture(folder, masks=masks)), Settings(), lambda _: None)
+        make_labeller(Task.of(open_capture(folder, masks=masks), Settings()), lambda _: None)
     assert "give a folder of masks" in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_median_background_with_parts_of_the_person_is_reported(tmp_path: Path) -> None:
     folder = write_people(tmp_path / "slow", [lambda k: (-0.75, 0.0) if k < 9 else (-0.75 + 0.13 * (k - 8), 0.0)], 20)
     notes: list[str] = []
-    make_segmenter(*setup_and_source(open_capture(folder, masks="median")), Settings(), notes.append)
+    make_labeller(Task.of(open_capture(folder, masks="median"), Settings()), notes.append)
     assert len(notes) == 2 and "the median shows parts" in notes[1] and "c1, c2" in notes[1]
 
 
@@ -133,22 +134,22 @@ def test_masks_show_everybody(walk: Path, tmp_path: Path, monkeypatch: pytest.Mo
     install(tmp_path / "site", monkeypatch, red=segmenter)
     capture = open_capture(walk)
     notes: list[str] = []
-    segment = make_segmenter(capture.setup(), capture, Settings(), notes.append)
+    label = make_labeller(Task.of(capture, Settings()), notes.append)
     assert "the segmenter red makes the masks" in notes[0] and "every frame" in notes[1] and len(notes) == 2
     with capture.frames() as frames:
         for frame in frames:
-            assert wrong(segment(frame), truth(walk, frame.index, everybody=True)).max() < 0.1, frame.index
+            assert wrong(label(frame).masks, truth(walk, frame.index, everybody=True)).max() < 0.1, frame.index
 
 
 def test_a_process_ahead_makes_the_same_masks(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From another frame on, too: nothing is carried over."""
     install(tmp_path / "site", monkeypatch, red="Finding")
     capture = open_capture(walk)
-    segment = make_segmenter(capture.setup(), capture, Settings(), lambda _: None)
+    label = make_labeller(Task.of(capture, Settings()), lambda _: None)
     with capture.frames(3, 6) as frames:
-        here = {frame.index: segment(frame) for frame in frames}
+        here = {frame.index: label(frame).masks for frame in frames}
     config = settings_file.from_toml(QUICK.replace("ahead = 0", "ahead = 2"))
-    with Ahead(capture.setup(), capture, config, lambda _: None) as source:
+    with Ahead(Task.of(capture, config), lambda _: None) as source:
         for observation, _ in source.frames(4, 6):
             np.testing.assert_array_equal(observation.masks, here[observation.index], strict=True)
 
@@ -158,7 +159,7 @@ def test_masks_without_a_person_are_empty(tmp_path: Path, monkeypatch: pytest.Mo
     folder = write_people(tmp_path / "left", [lambda k: None], 2)
     capture = open_capture(folder)
     with capture.frames() as frames:
-        assert not make_segmenter(capture.setup(), capture, Settings(), lambda _: None)(next(frames)).any()
+        assert not make_labeller(Task.of(capture, Settings()), lambda _: None)(next(frames)).masks.any()
 
 
 # --------------------------------------------------------------------------------------------------------- tk masks
@@ -214,7 +215,7 @@ class Scarlet:
 def test_a_segmenter_may_be_an_object(walk: Path) -> None:
     capture = replace(open_capture(walk), segmenter=Scarlet())
     assert mask_source(capture) == "segmenter Scarlet"
-    with open_observations(capture.setup(), capture, Settings(), lambda _: None) as observations:
+    with open_observations(Task.of(capture, Settings()), lambda _: None) as observations:
         (observation, _), *_ = observations.frames(0, 2)
     assert observation.masks.any(axis=(1, 2)).all() and (observation.masks == 0).mean() > 0.5
 

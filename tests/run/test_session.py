@@ -20,6 +20,7 @@ import pytest
 import tomli_w
 
 from scripts.synthetic.capture import Options, plan_capture, write_capture
+from tests import conftest
 from tests.conftest import FRAMES, QUICK, Silent, Tk
 from tests.io.conftest import write_picture
 from tk.errors import ConfigError, ResultError
@@ -36,7 +37,7 @@ from tk.trackers.registry import tracker_class
 
 ROOT = Path(__file__).parents[2]
 CONFIG = settings_file.from_toml(QUICK)
-track = partial(session.track, method="volumetric")
+track = partial(conftest.track, method="volumetric")
 
 # `tk` that sends itself a signal once a frame is finished
 VICTIM = """
@@ -59,7 +60,7 @@ cli.main(prog_name="tk")
 
 
 def run(capture: Path, output: Path, **options: Any) -> Summary:
-    return track(open_capture(capture), output, options.pop("config", CONFIG), Silent(), **options)
+    return track(open_capture(capture), output, options.pop("config", CONFIG), **options)
 
 
 def assert_same(path: Path, expected: Path, frames: slice = slice(None)) -> None:
@@ -201,10 +202,10 @@ def test_large_images_are_reduced_and_the_result_has_the_recorded_cameras(tmp_pa
     tall = capture.setup().person_pixels()
     config = replace(CONFIG, person_pixels=int(tall.min() / 2))
     reporter = Silent()
-    session.track(capture, half, config, reporter, frames=(0, 2), causal=True)
+    conftest.track(capture, half, config, reporter, frames=(0, 2), causal=True)
     (line,) = [note for note in reporter.notes if "reduced size" in note]
     assert "all cameras at 1/2 (the person is about" in line
-    session.track(capture, tmp_path / "full.h5", CONFIG, Silent(), frames=(0, 2), causal=True)
+    conftest.track(capture, tmp_path / "full.h5", CONFIG, frames=(0, 2), causal=True)
     found, full = read_result(half), read_result(tmp_path / "full.h5")
     assert found.cameras is not None
     for camera, expected in zip(found.cameras.rig, capture.rig, strict=True):
@@ -249,7 +250,7 @@ def test_lost_frames_of_all_runs_are_counted(copy: Path, tmp_path: Path, monkeyp
             write_picture(camera / f"{index:06d}.png", np.zeros((120, 160), np.uint8))
     result, capture = tmp_path / "r.h5", open_capture(copy)
     assert track(capture, result, CONFIG, stop_at(4)).lost == 2
-    assert track(capture, result, CONFIG, Silent(), resume=True).lost == 3
+    assert track(capture, result, CONFIG, resume=True).lost == 3
     status = read_result(result).status
     assert list(status[:3]) == [Status.INITIALISED, Status.TRACKED, Status.TRACKED]
     assert list(status[3:7]) == [Status.LOST, Status.LOST, Status.LOST, Status.RECOVERED]
@@ -362,7 +363,7 @@ def test_requested_frames_are_tracked(tiny: Path) -> None:
 def test_masks_are_made_from_the_videos(tiny: Path, tmp_path: Path, method: str, segmentation: str) -> None:
     config, path = settings_file.from_toml(f'segmentation = "{segmentation}"\n{QUICK}'), tmp_path / "r.h5"
     capture = open_capture(tiny, masks="none")
-    assert session.track(capture, path, config, Silent(), method, frames=(0, 4)).lost == 0
+    assert conftest.track(capture, path, config, method=method, frames=(0, 4)).lost == 0
     found, truth = read_result(path), read_joints(tiny / "truth.h5").positions[:4]
     assert np.linalg.norm(found.joints - truth, axis=2).mean() < 0.1 and (found.timing["masks"] > 0).all()
 

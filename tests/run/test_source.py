@@ -25,9 +25,9 @@ from tk.io.results.status import Status
 from tk.model.cameras.volume import Volume
 from tk.model.setup import Setup, Subject
 from tk.run import offline, session
-from tk.run.choice import Choice
 from tk.run.people import Member, People
-from tk.run.session import estimates, track_source
+from tk.run.session import estimates, track_task
+from tk.run.task import Choice, Task, TrackOptions
 from tk.trackers.protocol import Observation
 
 SETTINGS = settings_file.from_toml(QUICK)
@@ -71,11 +71,16 @@ class Rendered:
         return ()
 
 
+def task(setup: Setup, source: Rendered, **options: Any) -> Task:
+    """Return the task of tracking a simulated source."""
+    return Task(setup, source, TrackOptions(SETTINGS, **options))
+
+
 ONE = Rendered(draw_silhouettes(BODY, RIG, POSES))
 
 
 def test_a_source_in_memory_is_tracked() -> None:
-    found = list(estimates(SETUP, ONE, SETTINGS, frames=(1, 4)))
+    found = list(estimates(task(SETUP, ONE, frames=(1, 4))))
     assert [e.frame for e in found] == [1, 2, 3]
     assert [e.time for e in found] == [LATENCY_S + i / SETUP.fps for i in (1, 2, 3)]  # the source's clock
     for estimate, pose in zip(found, POSES[1:], strict=False):
@@ -83,7 +88,7 @@ def test_a_source_in_memory_is_tracked() -> None:
 
 
 def test_a_source_of_unknown_length_is_written_until_it_ends(tmp_path: Path) -> None:
-    summary = track_source(SETUP, ONE, tmp_path / "r.h5", SETTINGS, Silent(), causal=True)
+    summary = track_task(task(SETUP, ONE, causal=True), tmp_path / "r.h5", Silent())
     result = read_result(tmp_path / "r.h5")
     assert summary.frames == len(result.frames) == len(POSES) and summary.lost == 0
     assert result.meta.capture == "rendered" and result.smoothed is not None
@@ -91,7 +96,7 @@ def test_a_source_of_unknown_length_is_written_until_it_ends(tmp_path: Path) -> 
 
 
 def test_the_second_pass_needs_no_folder(tmp_path: Path) -> None:
-    track_source(SETUP, ONE, tmp_path / "r.h5", SETTINGS, Silent())
+    track_task(task(SETUP, ONE), tmp_path / "r.h5", Silent())
     result = read_result(tmp_path / "r.h5")
     expected = np.array([BODY.skeleton.joints(pose) for pose in POSES])
     assert np.linalg.norm(result.joints - expected, axis=2).mean() < 0.03
@@ -109,8 +114,8 @@ def test_frames_before_the_first_person_are_absent_and_the_others_as_if_tracking
 ) -> None:
     reporter, late, begun = Silent(), tmp_path / "late.h5", tmp_path / "begun.h5"
     any_pose = replace(SETUP, subjects=(replace(SETUP.subjects[0], in_init_pose=False),))
-    summary = track_source(SETUP, LATE, late, SETTINGS, reporter, people=people)
-    track_source(any_pose, LATE, begun, SETTINGS, Silent(), frames=(EMPTY, None), people=people)
+    summary = track_task(task(SETUP, LATE, people=people), late, reporter)
+    track_task(task(any_pose, LATE, frames=(EMPTY, None), people=people), begun, Silent())
     result, expected = read_result(late), read_result(begun)
     absent = 0 if people == "all" else EMPTY  # of several people, only frames with a person have rows
     assert (result.status == Status.ABSENT).tolist() == absent * [True] + len(POSES) * [False]
@@ -132,22 +137,22 @@ def test_a_run_that_began_with_an_empty_volume_is_resumed(
 
     monkeypatch.setattr(session, "WRITE_EVERY_S", 0)
     whole, part = tmp_path / "whole.h5", tmp_path / "part.h5"
-    track_source(SETUP, LATE, whole, SETTINGS, Silent())
-    stopped = track_source(SETUP, LATE, part, SETTINGS, Stop())
+    track_task(task(SETUP, LATE), whole, Silent())
+    stopped = track_task(task(SETUP, LATE), part, Stop())
     # frames are in the file from the first person on; before, there is none
     assert (stopped.interrupted, stopped.frames) == (True, stop + 1 if stop >= EMPTY else 0)
     assert part.exists() == (stop >= EMPTY) and len(list(tmp_path.iterdir())) == (3 if part.exists() else 1)
-    track_source(SETUP, LATE, part, SETTINGS, Silent(), resume=True)
+    track_task(task(SETUP, LATE), part, Silent(), resume=True)
     for name in ("pose", "status", "sigma"):
         np.testing.assert_array_equal(getattr(read_result(part), name), getattr(read_result(whole), name))
 
 
 def test_nobody_in_any_frame_is_an_error_that_leaves_no_file(tmp_path: Path) -> None:
     with refused(CaptureError, "nobody could be tracked: the working volume is empty"):
-        track_source(SETUP, LATE, tmp_path / "r.h5", SETTINGS, Silent(), frames=(0, EMPTY))
+        track_task(task(SETUP, LATE, frames=(0, EMPTY)), tmp_path / "r.h5", Silent())
     assert not list(tmp_path.iterdir())
     with refused(CaptureError, "the working volume is empty"):
-        list(estimates(SETUP, LATE, SETTINGS, frames=(0, EMPTY)))
+        list(estimates(task(SETUP, LATE, frames=(0, EMPTY))))
 
 
 def test_a_start_that_fails_after_somebody_has_entered_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -161,12 +166,12 @@ def test_a_start_that_fails_after_somebody_has_entered_is_repeated(monkeypatch: 
 
     monkeypatch.setattr(People, "_begin", refuse)
     slow = replace(SETUP, fps=4.0)  # attempts are half a second apart
-    found = list(estimates(slow, LATE, SETTINGS))
+    found = list(estimates(task(slow, LATE)))
     assert [e.status for e in found][:6] == EMPTY * ["absent"] + 2 * ["lost"] + ["initialised"]
     assert attempts == [EMPTY, EMPTY + 2]
     refused_in += range(len(found))
     with refused(CaptureError, "nobody could be tracked: half a person"):
-        list(estimates(slow, LATE, SETTINGS))
+        list(estimates(task(slow, LATE)))
 
 
 # --- two people -------------------------------------------------------------------------------------------------------
@@ -192,16 +197,14 @@ def test_silhouettes_of_the_pair_overlap() -> None:
 
 def test_two_people_are_tracked_and_a_resumed_run_is_the_same(tmp_path: Path) -> None:
     source, path = Rendered(MASKS.max(axis=0)), tmp_path / "r.h5"
-    track_source(PAIR, source, path, SETTINGS, Silent(), people="all", causal=True)
+    track_task(task(PAIR, source, people="all", causal=True), path, Silent())
     whole = read_result(path).people
     assert len(whole) == 2
     assert sorted(person for r in whole for person in (0, 1) if far_off(r.joints, person) < 0.03) == [0, 1]
     assert not any((r.status == Status.LOST).any() for r in whole)
     part = tmp_path / "part.h5"
     for stop, resume in ((3, False), (None, True)):
-        track_source(
-            PAIR, source, part, SETTINGS, Silent(), frames=(0, stop), people="all", causal=True, resume=resume
-        )  # fmt: skip
+        track_task(task(PAIR, source, frames=(0, stop), people="all", causal=True), part, Silent(), resume=resume)
     for a, b in zip(read_result(part).people, whole, strict=True):
         np.testing.assert_array_equal(a.pose, b.pose)
         np.testing.assert_array_equal(a.status, b.status)
@@ -211,18 +214,18 @@ def test_a_bystander_is_no_part_of_the_subject() -> None:
     notes: list[str] = []
     for person in (0, 1):
         found = list(
-            estimates(PAIR, Rendered(MASKS.max(axis=0)), SETTINGS, notes.append, frames=(0, COUNT), people=(person,))
+            estimates(task(PAIR, Rendered(MASKS.max(axis=0)), frames=(0, COUNT), people=(person,)), notes.append)
         )
         assert {e.person for e in found} == {0} and "lost" not in {e.status for e in found}
         joints = np.array([e.joints for e in found])
         assert min(far_off(joints, who) for who in (0, 1)) < 0.04
     assert not notes
-    list(estimates(PAIR, Rendered(MASKS.max(axis=0)), SETTINGS, notes.append, frames=(0, 1)))
+    list(estimates(task(PAIR, Rendered(MASKS.max(axis=0)), frames=(0, 1)), notes.append))
     assert any("2 people are in view" in note for note in notes)
 
 
 def test_the_second_pass_keeps_two_people_apart(tmp_path: Path) -> None:
-    track_source(PAIR, Rendered(MASKS.max(axis=0)), tmp_path / "r.h5", SETTINGS, Silent(), people="all")
+    track_task(task(PAIR, Rendered(MASKS.max(axis=0)), people="all"), tmp_path / "r.h5", Silent())
     found = read_result(tmp_path / "r.h5").people
     assert sorted(person for r in found for person in (0, 1) if far_off(r.joints, person) < 0.03) == [0, 1]
 
@@ -233,7 +236,7 @@ def test_a_run_stopped_between_two_people_s_second_passes_is_finished(
     def track(name: str, resume: bool = False) -> Path:
         path = tmp_path / name
         source, span = Rendered(MASKS.max(axis=0)), (0, COUNT)
-        track_source(PAIR, source, path, SETTINGS, Silent(), frames=span, people="all", resume=resume)
+        track_task(task(PAIR, source, frames=span, people="all"), path, Silent(), resume=resume)
         return path
 
     def stop_at_person_1(finisher: Any, member: Member, *rest: Any) -> None:
@@ -254,13 +257,13 @@ def test_a_run_stopped_between_two_people_s_second_passes_is_finished(
 def test_the_subject_position_chooses_the_person() -> None:
     for person in (0, 1):
         near = replace(PAIR.subjects[0], position=JOINTS[person][0, 0] + 0.1)
-        (found,) = estimates(replace(PAIR, subjects=(near,)), Rendered(MASKS.max(axis=0)), SETTINGS, frames=(0, 1))
+        (found,) = estimates(task(replace(PAIR, subjects=(near,)), Rendered(MASKS.max(axis=0)), frames=(0, 1)))
         assert far_off(found.joints[None], person) < 0.1
 
 
 def test_a_number_that_nobody_has_is_refused() -> None:
     with refused(CaptureError, "person 2 is asked for, but 2 were found"):
-        list(estimates(PAIR, Rendered(MASKS.max(axis=0)), SETTINGS, people=(2,)))
+        list(estimates(task(PAIR, Rendered(MASKS.max(axis=0)), people=(2,))))
 
 
 def track_entering(path: Path, count: int) -> tuple[np.ndarray, tuple[Result, ...]]:
@@ -270,7 +273,7 @@ def track_entering(path: Path, count: int) -> tuple[np.ndarray, tuple[Result, ..
     masks = np.array([draw_silhouettes(BODY, FOUR, own) for own in poses])
     masks[1, :3] = masks[1, 17:] = 0
     setup = replace(PAIR, fps=4.0, subjects=PAIR.subjects[:1])
-    track_source(setup, Rendered(masks.max(axis=0)), path, SETTINGS, Silent(), people="all", causal=True)
+    track_task(task(setup, Rendered(masks.max(axis=0)), people="all", causal=True), path, Silent())
     return poses, read_result(path).people
 
 

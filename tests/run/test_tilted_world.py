@@ -12,7 +12,7 @@ import pytest
 import tomli_w
 from scipy.spatial.transform import Rotation
 
-from tests.conftest import QUICK, Silent
+from tests.conftest import QUICK, track
 from tk.io import settings_file
 from tk.io.captures.calibration import camera_table
 from tk.io.captures.capture import open_capture
@@ -20,7 +20,6 @@ from tk.io.results.reader import read_joints, read_result
 from tk.model.cameras.tracker_frame import seen_from
 from tk.model.cameras.up import up_text
 from tk.model.cameras.volume import Volume
-from tk.run.session import track
 
 TURN = Rotation.from_euler("xyz", [-1.2, 0.3, 0.5]).as_matrix()
 
@@ -47,7 +46,7 @@ def tilted(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_person_is_tracked_in_a_tilted_world(tiny: Path, tilted: Path, tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
-    track(open_capture(tilted), path, settings_file.from_toml(QUICK), Silent(), "volumetric", (0, 6))
+    track(open_capture(tilted), path, settings_file.from_toml(QUICK), method="volumetric", frames=(0, 6))
     with h5py.File(path) as file:
         up = file.attrs["up"]
     np.testing.assert_allclose(open_capture(tilted).up_axis, TURN[:, 2], atol=1e-12)
@@ -71,7 +70,7 @@ def test_results_do_not_depend_on_the_worlds_rotation(tiny: Path, tmp_path: Path
     )
     results = []
     for name, one in (("as it is.h5", capture), ("turned.h5", turned)):
-        track(one, tmp_path / name, settings_file.from_toml(QUICK), Silent(), method, (0, 6))
+        track(one, tmp_path / name, settings_file.from_toml(QUICK), method=method, frames=(0, 6))
         results.append(read_result(tmp_path / name))
     expected, found = results
     assert found.smoothed is not None and expected.smoothed is not None

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from tests.conftest import FRAMES, QUICK, Silent, Tk, setup_and_source
+from tests.conftest import FRAMES, QUICK, Silent, Tk, track
 from tests.io.conftest import write_picture
 from tests.run.test_session import send
 from tk.commands.track import EXIT_LOST, end
@@ -27,7 +27,9 @@ from tk.io.results.reader import read_joints, read_result
 from tk.io.results.status import Status
 from tk.model.body.anthropometry import BodyDimensions
 from tk.run.offline import REFINED
-from tk.run.session import Summary, estimates, track
+from tk.run.plan import recording_task
+from tk.run.session import Summary, estimates
+from tk.run.task import RecordingOptions, Task
 from tk.trackers.bodies import body_and_poses, read_body
 from tk.trackers.protocol import Estimate, Observation
 from tk.trackers.region import RegionTracker
@@ -37,7 +39,11 @@ COLUMNS = ("frames", "time", "pose", "joints", "sigma", "residual", "status", "o
 
 
 def run(capture: Path, output: Path, reporter: Silent | None = None, **options: Any) -> Summary:
-    return track(open_capture(capture), output, CONFIG, reporter or Silent(), **options)
+    return track(open_capture(capture), output, CONFIG, reporter, **options)
+
+
+def task(capture: Path, frames: tuple[int, int]) -> Task:
+    return recording_task(open_capture(capture), RecordingOptions(CONFIG, frames=frames))
 
 
 def assert_same(path: Path, expected: Path, frames: slice = slice(None)) -> None:
@@ -101,14 +107,14 @@ def test_without_the_initialisation_pose_the_body_is_fitted_again(tiny: Path, tm
     settings.write_text(re.sub(r'pose = "[a-z-]*"', 'pose = "any"', settings.read_text()))
     models = []
     for causal in (True, False):
-        track(open_capture(folder), tmp_path / "r.h5", CONFIG, Silent(), frames=(0, 8), causal=causal, force=True)
+        track(open_capture(folder), tmp_path / "r.h5", CONFIG, frames=(0, 8), causal=causal, force=True)
         models.append(read_result(tmp_path / "r.h5").model)
     assert np.abs(models[0]["parts/shape"] - models[1]["parts/shape"]).max() > 1e-4
 
 
 def test_runs_repeat_bit_for_bit_with_any_seed(tiny: Path, causal: Path, tmp_path: Path) -> None:
     config = settings_file.from_toml(f"seed = 5\n{QUICK}")
-    track(open_capture(tiny), tmp_path / "r.h5", config, Silent(), frames=(0, 6), causal=True)
+    track(open_capture(tiny), tmp_path / "r.h5", config, frames=(0, 6), causal=True)
     assert_same(tmp_path / "r.h5", causal, slice(0, 6))
 
 
@@ -123,9 +129,7 @@ def test_result_that_contradicts_its_masks_is_suspect_and_ends_with_exit_code_3(
     assert (result.status == Status.SUSPECT).all() and result.has_pose.all()
     assert result.sigma is not None and np.isnan(result.sigma).all()
     assert any("suspect, frames 0 to 3" in note for note in reporter.notes)
-    assert [e.status for e in estimates(*setup_and_source(open_capture(tiny)), CONFIG, frames=(0, 2))] == [
-        "suspect"
-    ] * 2
+    assert [e.status for e in estimates(task(tiny, (0, 2)))] == ["suspect"] * 2
     with pytest.raises(SystemExit) as ended:
         end(tmp_path / "r.h5", summary, False, False)
     assert ended.value.code == EXIT_LOST
@@ -133,7 +137,7 @@ def test_result_that_contradicts_its_masks_is_suspect_and_ends_with_exit_code_3(
 
 
 def test_returned_estimates_are_those_of_the_first_pass(tiny: Path, causal: Path) -> None:
-    found = list(estimates(*setup_and_source(open_capture(tiny)), CONFIG, frames=(0, 4)))
+    found = list(estimates(task(tiny, (0, 4))))
     expected = read_result(causal)
     assert [e.frame for e in found] == [0, 1, 2, 3]
     np.testing.assert_array_equal([e.joints for e in found], expected.joints[:4])
@@ -142,7 +146,7 @@ def test_returned_estimates_are_those_of_the_first_pass(tiny: Path, causal: Path
 
 def test_estimates_keep_no_reference_to_images(tiny: Path) -> None:
     """Whoever collects them holds some kilobytes a frame."""
-    found = list(estimates(*setup_and_source(open_capture(tiny)), CONFIG, frames=(0, 4)))
+    found = list(estimates(task(tiny, (0, 4))))
     assert len(found) == 4
     for estimate in found:
         arrays = [value for value in vars(estimate).values() if isinstance(value, np.ndarray)]
@@ -193,7 +197,7 @@ def test_an_interrupted_run_gets_its_second_pass_when_complete(tiny: Path, refin
     config = replace(CONFIG, ahead=2)
     summary = track(open_capture(tiny), result, config, Stop())
     assert summary.interrupted and REFINED not in read_result(result).model
-    assert not track(open_capture(tiny), result, config, Silent(), resume=True).interrupted
+    assert not track(open_capture(tiny), result, config, resume=True).interrupted
     assert_same(result, refined)
 
 
@@ -299,7 +303,7 @@ def test_frames_without_known_joints_are_reported(
     (line,) = (note for note in result.notes if "σ is unknown" in note)
     assert line.endswith(f"σ is unknown, frames {first} to 3") and line in reporter.notes
     notes: list[str] = []
-    assert len(list(estimates(*setup_and_source(open_capture(tiny)), CONFIG, notes.append, frames=(0, 5)))) == 5
+    assert len(list(estimates(task(tiny, (0, 5)), notes.append))) == 5
     assert any(note.endswith("σ is unknown, frames 2 to 3") for note in notes)
 
 
@@ -393,7 +397,7 @@ def test_the_volumetric_tracker_accepts_and_stores_a_body(
     file.write_text(file.read_text(encoding="utf-8").replace("da-vinci", "any"), encoding="utf-8")
     for method, given in (("volumetric", causal), ("region", tracked)):
         path = tmp_path / f"{method}.h5"
-        track(open_capture(copy), path, CONFIG, Silent(), method, (6, 9), body=given, causal=True)
+        track(open_capture(copy), path, CONFIG, method=method, frames=(6, 9), body=given, causal=True)
         found, expected = read_result(path), read_result(given)
         assert found.frames.tolist() == [6, 7, 8] and not (found.status == Status.LOST).any()
         np.testing.assert_array_equal(found.model["parts/shape"], expected.model["parts/shape"])

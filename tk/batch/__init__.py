@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tk.batch.jobs import Job, Outcome, TrackOptions
+from tk.batch.jobs import Job, Outcome
 from tk.batch.run import BatchReporter, exit_code, run_batch
 
-__all__ = ["BatchReporter", "Job", "Outcome", "TrackOptions", "exit_code", "run_batch"]
+__all__ = ["BatchReporter", "Job", "Outcome", "exit_code", "run_batch"]

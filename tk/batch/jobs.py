@@ -11,14 +11,14 @@ import json
 import os
 import socket
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from tk.errors import ConfigError, ResultError
 from tk.io.paths import check_not_input, replacing, resolved
 from tk.io.settings_file import to_toml
-from tk.settings import Settings
+from tk.run.task import RecordingOptions, describe
 
 #: folder of the records in the batch's folder
 RECORDS = "jobs"
@@ -26,34 +26,24 @@ RECORDS = "jobs"
 WAITING, BEGUN, DONE, FAILED = "waiting", "begun", "done", "failed"
 
 
-@dataclass(frozen=True)
-class TrackOptions:
-    """Options of `tk track` that are the same for every capture; see :func:`tk.run.session.track`."""
+def described(options: RecordingOptions) -> dict[str, str]:
+    """Return each option as text. They must be the same when a batch is continued.
 
-    method: str = "region"
-    frames: tuple[int, int | None] = (0, None)
-    cameras: tuple[str, ...] | None = None
-    masks: str = "auto"
-    body: Path | None = None  # a result or a TOML file with the body of the person, the same in all captures
-    causal: bool = False
-    store_hull: bool = False
-    people: str = "auto"
-    config: Settings = field(default_factory=Settings)
-
-    def to_dict(self) -> dict[str, str]:
-        """Return each option as text. They must be the same when a batch is continued."""
-        start, stop = self.frames
-        return {
-            "method": self.method,
-            "frames": f"{start}:{'' if stop is None else stop}",
-            "cameras": ",".join(self.cameras) if self.cameras else "all",
-            "masks": self.masks,
-            "body": "none" if self.body is None else _hash(_content(self.body)),
-            "causal": "yes" if self.causal else "no",
-            "stored hull": "yes" if self.store_hull else "no",
-            "people": self.people,
-            "settings": _hash(to_toml(self.config).encode()),
-        }
+    Raises:
+        ConfigError: the file of the body cannot be read.
+    """
+    start, stop = options.frames
+    return {
+        "method": options.method,
+        "frames": f"{start}:{'' if stop is None else stop}",
+        "cameras": ",".join(options.cameras) if options.cameras else "all",
+        "masks": options.masks,
+        "body": "none" if options.body is None else _hash(_content(options.body)),
+        "causal": "yes" if options.causal else "no",
+        "stored hull": "yes" if options.store_hull else "no",
+        "people": describe(options.people),
+        "settings": _hash(to_toml(options.settings).encode()),
+    }
 
 
 @dataclass(frozen=True)
@@ -100,7 +90,7 @@ class Job:
     name: str  # name of its result without suffix, unique in the folder
     capture: Path  # folder of the capture, absolute
     folder: Path  # folder of the batch, absolute
-    options: TrackOptions  # options of tracking
+    options: RecordingOptions  # options of tracking
     pictures: bool = False  # write an overlay video and a report next to the result
 
     @property
@@ -121,7 +111,7 @@ class Job:
     def write(self, outcome: Outcome) -> None:
         """Replace the record atomically."""
         worker = {"host": socket.gethostname(), "pid": os.getpid()}
-        record = {"capture": str(self.capture), "options": self.options.to_dict(), "by": worker, **asdict(outcome)}
+        record = {"capture": str(self.capture), "options": described(self.options), "by": worker, **asdict(outcome)}
         with replacing(self.record, ResultError) as part:
             part.write_text(json.dumps(record, indent=2), encoding="utf-8")
 
@@ -131,7 +121,7 @@ class Job:
             return Outcome()
         record = _read_record(self.record)
         options = record.get("options")
-        for name, value in self.options.to_dict().items():
+        for name, value in described(self.options).items():
             found = options.get(name) if isinstance(options, dict) else None
             if found != value:
                 raise ResultError(
@@ -145,7 +135,7 @@ class Job:
             raise _damaged(self.record) from None
 
 
-def make_jobs(captures: Sequence[Path], folder: Path, options: TrackOptions, pictures: bool = False) -> list[Job]:
+def make_jobs(captures: Sequence[Path], folder: Path, options: RecordingOptions, pictures: bool = False) -> list[Job]:
     """Return a job with a unique name for each capture.
 
     A capture keeps the name from an earlier run in this folder. A new one has the name of its folder; if the name is

@@ -14,11 +14,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol
 
-from tk.batch.jobs import DONE, FAILED, RECORDS, Job, Outcome, TrackOptions, make_jobs
+from tk.batch.jobs import DONE, FAILED, RECORDS, Job, Outcome, described, make_jobs
 from tk.batch.summary import write_summary
 from tk.batch.work import TOPIC, work
 from tk.errors import ConfigError, ResultError, TkError, WorkerError
 from tk.io.paths import locked
+from tk.run.task import RecordingOptions
 from tk.run.worker import cores
 
 #: seconds to wait for a scheduler's answer; a remote one may be slow, an absent one never answers
@@ -46,7 +47,7 @@ class BatchReporter(Protocol):
 def run_batch(
     captures: Sequence[Path],
     folder: Path,
-    options: TrackOptions,
+    options: RecordingOptions,
     reporter: BatchReporter,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -81,7 +82,7 @@ def run_batch(
         raise ConfigError("workers: a scheduler has its own; give workers or a scheduler, not both")
     if workers is not None and not 1 <= workers <= 1000:
         raise ConfigError(f"workers = {workers}: choose from 1 to 1000")
-    options.to_dict()  # fails early if the body cannot be read
+    described(options)  # fails early if the body cannot be read
     _require_dask(dashboard)
     with _locked(folder):
         jobs = make_jobs(captures, folder, options, pictures)

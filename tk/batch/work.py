@@ -59,19 +59,14 @@ def _track(job: Job, reporter: _Reporter) -> Outcome:
     from tk.io.results.reader import read_result
     from tk.report.after import write_video_and_report
     from tk.run import session  # heavy; the process that starts the batch does not need it
-    from tk.run.choice import parse_choice
 
     options = job.options
-    capture = open_recording(job.capture, options.cameras, options.masks, options.config.resample)
+    capture = open_recording(job.capture, options.cameras, options.masks, options.settings.resample)
     deadline = time.monotonic() + _WAIT_S
     while True:
         reporter.notes.clear()
         try:
-            summary = session.track(
-                capture, job.output, options.config, reporter, options.method, options.frames,
-                resume=True, store_hull=options.store_hull, body=options.body, causal=options.causal,
-                people=parse_choice(options.people),
-            )  # fmt: skip
+            summary = session.track(capture, job.output, options, reporter, resume=True)
             break
         except ResultBusyError:
             if time.monotonic() > deadline:

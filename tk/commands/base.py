@@ -22,6 +22,7 @@ from tk.commands.console import ConsoleReporter
 from tk.errors import ConfigError, TkError
 
 if TYPE_CHECKING:
+    from tk.run.task import RecordingOptions
     from tk.settings import Settings
 
 
@@ -164,10 +165,6 @@ preset_option = click.option("--preset", metavar="NAME", help="Settings to start
 resample_option = click.option(
     "--resample", is_flag=True, default=None, help="Choose images by time stamps: cameras of different rates."
 )
-people_option = click.option(
-    "--people", default="auto", show_default=True, metavar="auto|all|N,M",
-    help="Whom to track: auto: one person; all: everybody; N,M: by the numbers of tk inspect.",
-)  # fmt: skip
 resume_option = click.option("--resume", is_flag=True, help="Continue an interrupted run of the same command.")
 force_option = click.option("--force", is_flag=True, help="Replace existing output.")
 quiet_option = click.option("-q", "--quiet", is_flag=True, help="Show no progress, only notes and errors.")
@@ -175,7 +172,7 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print the re
 
 
 @dataclass(frozen=True)
-class TrackingOptions:
+class GivenOptions:
     """The options that `tk track` and `tk batch` share, as given on the command line."""
 
     method: str
@@ -185,15 +182,35 @@ class TrackingOptions:
     seed: int | None
     masks: str
     body: Path | None
+    people: str
     causal: bool
     store_hull: bool
     resample: bool | None
     preset: str | None
     config_file: Path | None
 
-    def settings(self) -> Settings:
-        """Return the settings that the options describe."""
-        return load_settings(self.config_file, self.preset, voxels=self.voxels, seed=self.seed, resample=self.resample)
+    def options(self) -> RecordingOptions:
+        """Return them with the settings that they describe.
+
+        Raises:
+            ConfigError: the settings cannot be read, or the people are not described correctly.
+        """
+        from tk.run.task import RecordingOptions, parse_choice
+
+        settings = load_settings(
+            self.config_file, self.preset, voxels=self.voxels, seed=self.seed, resample=self.resample
+        )
+        return RecordingOptions(
+            settings=settings,
+            method=self.method,
+            frames=self.frames,
+            people=parse_choice(self.people),
+            causal=self.causal,
+            store_hull=self.store_hull,
+            cameras=self.cameras,
+            masks=self.masks,
+            body=self.body,
+        )
 
 
 _TRACKING_OPTIONS = (
@@ -208,6 +225,10 @@ _TRACKING_OPTIONS = (
     click.option("--seed", type=int, help="Seed of the random generator.  [default: 0]"),
     masks_option,
     click.option("--body", type=PATH, metavar="FILE", help="Use the body of a result (.h5) or of a TOML file."),
+    click.option(
+        "--people", default="auto", show_default=True, metavar="auto|all|N,M",
+        help="Whom to track: auto: one person; all: everybody; N,M: by the numbers of tk inspect.",
+    ),
     click.option("--causal", is_flag=True, help="Run the first pass only: no frame depends on later frames."),
     click.option("--store-hull", is_flag=True, help="Store the coloured surface of the visual hull in the result."),
     resample_option,
@@ -217,12 +238,12 @@ _TRACKING_OPTIONS = (
 
 
 def tracking_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of :class:`TrackingOptions` to a command, which receives them as ``options``."""
-    names = [field.name for field in fields(TrackingOptions)]
+    """Add the options of :class:`GivenOptions` to a command, which receives them as ``given``."""
+    names = [field.name for field in fields(GivenOptions)]
 
     @functools.wraps(command)
-    def grouped(**given: Any) -> None:
-        command(options=TrackingOptions(**{name: given.pop(name) for name in names}), **given)
+    def grouped(**options: Any) -> None:
+        command(given=GivenOptions(**{name: options.pop(name) for name in names}), **options)
 
     for option in reversed(_TRACKING_OPTIONS):
         grouped = option(grouped)

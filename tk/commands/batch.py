@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -20,7 +21,6 @@ from tk.commands.console import BatchConsoleReporter
 @click.option("--scheduler", metavar="ADDRESS", help="Use the workers of this Dask scheduler: tcp://host:8786.")
 @click.option("--dashboard", is_flag=True, help="Serve Dask's page about workers and tasks.")
 @base.tracking_options
-@base.people_option
 @base.no_report_option
 @base.quiet_option
 def batch(
@@ -29,32 +29,18 @@ def batch(
     workers: int | None,
     scheduler: str | None,
     dashboard: bool,
-    options: base.TrackingOptions,
-    people: str,
+    given: base.GivenOptions,
     no_report: bool,
     quiet: bool,
 ) -> None:
     """Track many captures into FOLDER and write a summary; after an interruption, the same command continues."""
-    from tk.batch import TrackOptions, exit_code, run_batch
-    from tk.run.choice import parse_choice
+    from tk.batch import exit_code, run_batch
 
-    parse_choice(people)  # a mistake ends the command before the first capture
-    track_options = TrackOptions(
-        options.method,
-        options.frames,
-        options.cameras,
-        options.masks,
-        options.body and options.body.resolve(),
-        options.causal,
-        options.store_hull,
-        people,
-        options.settings(),
-    )
+    options = given.options()
+    options = replace(options, body=options.body and options.body.resolve())  # workers may run in other folders
     with BatchConsoleReporter(quiet) as reporter:
         try:
-            outcomes = run_batch(
-                captures, output, track_options, reporter, workers, scheduler, not no_report, dashboard
-            )
+            outcomes = run_batch(captures, output, options, reporter, workers, scheduler, not no_report, dashboard)
         except KeyboardInterrupt:
             raise KeyboardInterrupt("the same command continues") from None
     if not quiet:

@@ -28,12 +28,13 @@ def demo(output: Path, voxels: int | None, resume: bool, force: bool, no_report:
             from tk.io.captures.capture import open_capture
             from tk.io.results.files import check_result_path
             from tk.run import session
+            from tk.run.task import RecordingOptions
 
             check_result_path(output, force, resume)
             reporter.stage(f"opening the capture that ships with tk, {folder}")
-            settings = base.load_settings(None, voxels=voxels)
+            options = RecordingOptions(base.load_settings(None, voxels=voxels))
             capture = open_capture(folder)
-            summary = session.track(capture, output, settings, reporter, resume=resume, force=force)
+            summary = session.track(capture, output, options, reporter, resume, force)
             if not no_report:
                 draw_video_and_report(capture, output, summary, reporter, quiet)
         if not summary.interrupted:

@@ -45,7 +45,7 @@ def inspect(
                 check_not_input(picture, capture=capture)
         settings = base.load_settings(config_file, resample=resample)
         opened = open_recording(capture, cameras, masks, settings.resample)
-        _, opened = reduce_images(opened.setup(), opened, settings.person_pixels)
+        opened = reduce_images(opened, settings.person_pixels)
         found, shown = check(opened, settings)
         if sheet is not None and plan is not None:
             write_sheet(sheet, opened, found, shown)

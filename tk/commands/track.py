@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,7 +38,6 @@ WARN_SHARE = 0.2
     "--init-pose", type=base.PATH, metavar="FILE",
     help="Start from the approximate pose in this TOML file, or from this folder of 2D keypoints.",
 )  # fmt: skip
-@base.people_option
 @base.resume_option
 @base.force_option
 @base.no_report_option
@@ -46,9 +46,8 @@ WARN_SHARE = 0.2
 def track(
     capture: Path,
     output: Path,
-    options: base.TrackingOptions,
+    given: base.GivenOptions,
     init_pose: Path | None,
-    people: str,
     resume: bool,
     force: bool,
     no_report: bool,
@@ -59,23 +58,19 @@ def track(
 
     An overlay video (RESULT.mp4) and a report (RESULT.html) are written next to it.
     """
-    reporter = ConsoleReporter(quiet, None, *later_stages(options.causal, no_report), "loading")
+    reporter = ConsoleReporter(quiet, None, *later_stages(given.causal, no_report), "loading")
     with reporter, started_early():
         from tk.io.importers import open_recording
         from tk.io.results.files import check_result_path
         from tk.run import session
-        from tk.run.choice import parse_choice
 
-        settings, choice = options.settings(), parse_choice(people)
-        if settings.ahead == 0:
+        options = replace(given.options(), init_pose=init_pose)
+        if options.settings.ahead == 0:
             dismiss()
         check_result_path(output, force, resume)
         reporter.stage(f"opening {capture}")
-        opened = open_recording(capture, options.cameras, options.masks, settings.resample)
-        summary = session.track(
-            opened, output, settings, reporter, options.method, options.frames, init_pose, resume, options.store_hull,
-            options.body, options.causal, force, choice,
-        )  # fmt: skip
+        opened = open_recording(capture, options.cameras, options.masks, options.settings.resample)
+        summary = session.track(opened, output, options, reporter, resume, force)
         if not no_report:
             draw_video_and_report(opened, output, summary, reporter, quiet)
     end(output, summary, quiet, as_json)

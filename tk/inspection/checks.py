@@ -30,6 +30,7 @@ from tk.model.masks.mask_agreement import INCONSISTENT, Agreement, MaskAgreement
 from tk.model.masks.regions import clean_by_area
 from tk.model.masks.silhouettes import HOLE_SHARE
 from tk.run.segmentation import make_labeller
+from tk.run.task import Task
 from tk.settings import Settings
 from tk.threads import one_thread
 
@@ -182,7 +183,7 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
     near = {i + s for i in centers for s in range(-_LARGEST_DELAY, _LARGEST_DELAY + 1)} & set(range(span))
     kept = frames[np.linspace(0, len(frames) - 1, min(pictures, len(frames))).round().astype(int)]
     notes: list[str] = list(capture.warnings)
-    label = make_labeller(capture.setup(), capture, config, notes.append)
+    label = make_labeller(Task.of(capture, config), notes.append)
     watch = PeopleWatch(capture, span)
     health, sick = ImageHealth(), np.zeros(len(capture.rig), int)
     masks: dict[int, Masks] = {}

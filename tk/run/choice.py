@@ -1,4 +1,4 @@
-"""Who is tracked: the user's choice, and what is known of each person."""
+"""Who is tracked: the people of the user's choice among those found, and what is known of each."""
 
 from __future__ import annotations
 
@@ -8,32 +8,11 @@ import numpy as np
 import scipy  # its packages are imported when they are first used
 from numpy.typing import NDArray
 
-from tk.errors import CaptureError, ConfigError
+from tk.errors import CaptureError
 from tk.model.cameras.up import up_vector
 from tk.model.people import LocatedPerson
 from tk.model.setup import Subject
-
-Choice = str | tuple[int, ...]
-"""Who is tracked: "auto" (one person), "all", or numbers."""
-
-
-def parse_choice(text: str) -> Choice:
-    """Return the choice that a user gives as "auto", "all" or numbers, such as "0,2".
-
-    Raises:
-        ConfigError: it is none of these.
-    """
-    if text in ("auto", "all"):
-        return text
-    numbers = [part.strip() for part in text.split(",")]
-    if not all(part.isdecimal() for part in numbers) or len(set(numbers)) < len(numbers):
-        raise ConfigError(f"people {text!r}: give auto, all, or different numbers from 0 on, such as 0,2")
-    return tuple(map(int, numbers))
-
-
-def describe(choice: Choice) -> str:
-    """Return a choice as the user gives it."""
-    return choice if isinstance(choice, str) else ",".join(map(str, choice))
+from tk.run.task import Choice
 
 
 def chosen(

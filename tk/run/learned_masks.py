@@ -26,11 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.io.captures.frames import FrameSet
-from tk.io.captures.source import Source
 from tk.model.masks.foreground import CollinearityForeground
 from tk.model.masks.learned_scene import LearnedScene
-from tk.model.setup import Setup
-from tk.settings import Settings
+from tk.run.task import Task
 
 if TYPE_CHECKING:  # SciPy, which takes long to import
     from tk.segmenters.people_masks import PeopleMasks
@@ -89,8 +87,9 @@ class _Span:
 class LearnedMasks:
     """Segments the people in the frames of a recording, best in order."""
 
-    def __init__(self, setup: Setup, source: Source, settings: Settings, people: PeopleMasks) -> None:
-        self._source, self._settings, self._people = source, settings, people
+    def __init__(self, task: Task, people: PeopleMasks) -> None:
+        setup, source = task.setup, task.source
+        self._source, self._settings, self._people = source, task.settings, people
         self._sizes = [(camera.width, camera.height) for camera in setup.rig]
         self._fps, self._cameras = setup.fps, len(setup.rig)
         self._edges = _edges(source.first_frame, source.frame_count, setup.fps)

@@ -22,11 +22,11 @@ from tk.model.cameras.bundle import TrackedPoses
 from tk.model.masks.image_health import described
 from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
-from tk.run.identity import COLUMNS, EXCHANGED, UNCLEAR, Contact, doubtful, exchange_masks, exchanged, report
-from tk.run.people import Member
-from tk.run.plan import Plan
+from tk.run.identity import COLUMNS, EXCHANGED, UNCLEAR, doubtful, exchange_masks, exchanged, report
+from tk.run.people import Member, People
 from tk.run.prefetch import open_observations
 from tk.run.refinement import compare_cameras, refine_if_inconsistent, retimed
+from tk.run.task import Task
 from tk.trackers.protocol import Estimate, Observation, TwoPassTracker, two_pass
 from tk.trackers.region import UNKNOWN_AFTER
 from tk.trackers.residual import contradicted
@@ -48,9 +48,8 @@ _LESS_SURE = 2.0
 
 def finish(
     output: Path,
-    plan: Plan,
-    people: Sequence[Member],
-    contacts: Sequence[Contact],
+    task: Task,
+    people: People,
     masks: MaskStores | None,
     note: Note,
     within: Callable[[float], None],
@@ -61,9 +60,9 @@ def finish(
 
     The second pass uses ``masks``; None: no second pass. ``within`` receives the share of a long stage that is done.
     """
-    finisher = _Finisher(
-        output, plan, len(people) == 1, note, within, UsedCameras(plan.setup.rig, np.array(plan.source.time_offset_s))
-    )
+    members, contacts = people.members, people.contacts
+    cameras = UsedCameras(task.setup.rig, np.array(task.source.time_offset_s))
+    finisher = _Finisher(output, task, len(members) == 1, note, within, cameras)
     if finished:  # the first pass of a finished person is gone
         contacts = [replace(c, outcome=UNCLEAR) if c.outcome == EXCHANGED else c for c in contacts]
     found = read_result(output).people
@@ -73,7 +72,7 @@ def finish(
             exchange_masks(contact, [masks[number] for number in contact.people])
     for line in report(contacts):
         note(line)
-    for member in people:
+    for member in members:
         number = member.number
         if number in finished:
             finisher.use_cameras_of_file()
@@ -123,7 +122,7 @@ class _Finisher:
     """Finishes people one after the other. Person 0 decides whether the cameras are refined."""
 
     output: Path
-    plan: Plan
+    task: Task
     alone: bool  # whether the result has one person
     note: Note
     within: Callable[[float], None]
@@ -131,7 +130,7 @@ class _Finisher:
 
     def use_cameras_of_file(self) -> None:
         """Use the cameras of a person who was finished by an earlier run, if they are other ones."""
-        rig, stored = self.plan.setup.rig, read_result(self.output).cameras or self.cameras
+        rig, stored = self.task.setup.rig, read_result(self.output).cameras or self.cameras
         used = stored.rig.recorded().reduced(rig.reductions)
         if not np.allclose(pack_cameras(used), pack_cameras(rig), rtol=_ROUNDED, atol=_ROUNDED):
             self.cameras = replace(stored, rig=used)
@@ -139,7 +138,7 @@ class _Finisher:
     def finish(self, member: Member, draft: _Draft, masks: MaskStore | None) -> None:
         """Write what needs all frames of a person: the second pass; segments, feet and angles; the smoothed copy;
         cameras. The result is replaced in one step: if this is interrupted, the result of the first pass stays."""
-        tracker, setup = member.tracker, self.plan.setup
+        tracker, setup = member.tracker, self.task.setup
         if not tracker.has_segments:
             return
         model: Mapping[str, Value] | None = None
@@ -169,8 +168,7 @@ class _Finisher:
             )
             return False
         if missing:
-            plan = self.plan
-            with open_observations(plan.setup, plan.source, plan.settings, lambda _: None) as observations:
+            with open_observations(self.task, lambda _: None) as observations:
                 for observation, _ in observations.frames(min(missing), max(missing) + 1):
                     masks.put(observation.index, tracker.cleaned(tracker.without_foreign(observation).masks))
         return True
@@ -204,7 +202,7 @@ class _Finisher:
     ) -> tuple[TwoPassTracker, MaskStore]:
         """Return the tracker with refined cameras, and synchronised masks, if the cameras disagree about person 0 and
         ``settings.refine`` is True, else both as they are. Other people take over what person 0 has decided."""
-        plan, result = self.plan, draft.result
+        task, result = self.task, draft.result
         _LOG.info("second pass: comparing the cameras")
         tracked = TrackedPoses(result.frames, result.pose, result.has_pose)
         agreement = compare_cameras(tracker, masks, tracked)
@@ -212,15 +210,15 @@ class _Finisher:
             self.note(f"{apart}: all frames are suspect")
             draft.unclear = ~draft.lost
         if person:
-            late = np.round((self.cameras.time_offset_s - plan.source.time_offset_s) * plan.setup.fps).astype(np.int64)
+            late = np.round((self.cameras.time_offset_s - task.source.time_offset_s) * task.setup.fps).astype(np.int64)
             return tracker.with_cameras(self.cameras.rig), retimed(masks, result.frames, late)
-        if agreement is None or apart or not plan.settings.refine:
+        if agreement is None or apart or not task.settings.refine:
             return tracker, masks
         refined = refine_if_inconsistent(tracker, agreement, masks, tracked, self.note)
         if refined is None:
             return tracker, masks
         tracker, masks, offsets = refined
-        self.cameras = UsedCameras(tracker.rig, self.cameras.time_offset_s + offsets / plan.setup.fps)
+        self.cameras = UsedCameras(tracker.rig, self.cameras.time_offset_s + offsets / task.setup.fps)
         if np.round(offsets).any() and self.alone:
             self.note("tracking again: the images of the first pass were not synchronised")
             self._track_again(tracker, masks, draft)
@@ -229,7 +227,7 @@ class _Finisher:
     def _track_again(self, tracker: TwoPassTracker, masks: MaskStore, draft: _Draft) -> None:
         """Track the frames again of which every synchronised camera has an image, beginning at the first pass's pose;
         none if the source cannot be read again. ``masks``: synchronised; they are not made again."""
-        result, source = draft.result, self.plan.source.shifted(self.cameras.time_offset_s.tolist())
+        result, source = draft.result, self.task.source.shifted(self.cameras.time_offset_s.tolist())
         if source is None or source.frame_count is None:
             return
         present = np.flatnonzero(result.status != Status.ABSENT)
@@ -254,7 +252,7 @@ class _Finisher:
         residual is high."""
         sigma, tracked = draft.current("joints/sigma"), ~draft.lost
         suspect = tracked.copy()
-        suspect[suspect] = contradicted(draft.current("residual")[suspect], self.plan.settings.region.false_alarm)
+        suspect[suspect] = contradicted(draft.current("residual")[suspect], self.task.settings.region.false_alarm)
         unclear = draft.unclear & tracked  # tracking again may have lost frames
         unknown = tracked & np.isnan(sigma).all(axis=1)
         if second_pass:  # without one, no frame depends on later ones

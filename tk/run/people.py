@@ -30,9 +30,10 @@ from tk.model.cues.part_colors import RenderedBody
 from tk.model.cues.ray_costs import RayGrid
 from tk.model.masks.image_health import contradiction, sampled
 from tk.model.people import LocatedPerson, PeopleFinder, order_people
-from tk.model.setup import Setup, Subject
-from tk.run.choice import Choice, chosen, matched, unknown
+from tk.model.setup import Subject
+from tk.run.choice import chosen, matched, unknown
 from tk.run.identity import EXCHANGED, UNCLEAR, Contact, Contacts, outcome_of
+from tk.run.task import Task
 from tk.trackers.camera_monitor import CameraMonitor, opening_agreement, spread_over
 from tk.trackers.protocol import Estimate, Observation, SharingTracker, Tracker, sharing
 from tk.trackers.sharing import UNKNOWN, UNKNOWN_BY_HULLS, PixelOwners, assign, cast_points
@@ -92,20 +93,17 @@ class People:
     """Steps the trackers of a run.
 
     Args:
-        setup: the scene.
+        task: the scene, and who is tracked.
         first: a tracker.
-        make: makes another tracker.
-        choice: who is tracked.
         note: receives messages for the user.
     """
 
-    def __init__(
-        self, setup: Setup, first: Tracker, make: Callable[[], Tracker], choice: Choice, note: Callable[[str], None]
-    ) -> None:
-        self._setup, self._first, self._make, self._choice, self._note = setup, first, make, choice, note
+    def __init__(self, task: Task, first: Tracker, note: Callable[[str], None]) -> None:
+        self._task, self._setup, self._choice = task, task.setup, task.options.people
+        self._first, self._note = first, note
         self._tracked: list[Member] = []
         self._contacts = Contacts()
-        self._every = max(1, round(LOOK_EVERY_S * setup.fps))
+        self._every = max(1, round(LOOK_EVERY_S * task.setup.fps))
         self._unknown: deque[Observation] = deque(maxlen=_HISTORY)  # people who are unknown, in the last frames
         self._refused = 0  # consecutive people who could not be tracked
         self._admit_from = 0  # the frame from which on another may be
@@ -114,6 +112,10 @@ class People:
         self._known_finder: PeopleFinder | None = None
         share = sharing(first)
         self._grid: RayGrid | None = None if share is None else share.choice
+
+    def _make(self) -> Tracker:
+        """Return another tracker of the same method."""
+        return type(self._first).of(self._task.setup, self._task.settings)
 
     def _member(self, number: int, subject: Subject, tracker: Tracker, written: bool = True) -> Member:
         return Member(number, subject, tracker, CameraMonitor(tracker, self._setup, subject), written)

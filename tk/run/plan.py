@@ -7,7 +7,6 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from tk.model.body.skeleton import SEGMENTS, build_skeleton
 from tk.model.setup import Setup, Subject
 from tk.run.prefetch import TIMING_STAGES, Observations, open_observations
 from tk.run.segmentation import mask_source, sources_of_masks
-from tk.settings import Settings
+from tk.run.task import RecordingOptions, Task, describe
 from tk.trackers.bodies import read_body
 from tk.trackers.protocol import Tracker
 from tk.trackers.registry import tracker_class
@@ -31,29 +30,34 @@ from tk.trackers.registry import tracker_class
 _LOG = logging.getLogger(__name__)
 
 
-def recording_setup(capture: Capture, init_pose: Path | None, body: Path | None, first_frame: int) -> Setup:
-    """Return a capture's setup, with the initial pose and the body that files give for its subject.
-
-    Args:
-        capture: the recording.
-        init_pose: a file with a rough initial pose, see :mod:`tk.io.captures.init_pose`, or a folder of 2D keypoints,
-            see :mod:`tk.io.captures.keypoints`.
-        body: a result or a TOML file that holds a body.
-        first_frame: first frame that is asked for.
+def recording_task(capture: Capture, options: RecordingOptions) -> Task:
+    """Return the task of tracking a recording.
 
     Raises:
-        TkError: a file cannot be used, or the pose is not in the recording.
+        TkError: a file of the options cannot be used, or the initial pose is not in the recording.
     """
+    # stored in the result, so that the capture is opened in the same way
+    settings = replace(options.settings, resample=capture.resampled)
+    setup = _recording_setup(capture, options)
+    small = reduce_images(capture, settings.person_pixels)
+    return Task(replace(setup, rig=small.rig), small, replace(options, settings=settings), small.warnings)
+
+
+def _recording_setup(capture: Capture, options: RecordingOptions) -> Setup:
+    """Return a capture's setup, with the initial pose and the body that files give for its subjects."""
+    first_frame = options.frames[0]
     setup = capture.setup()
     subjects: list[Subject] = []
     names = build_skeleton(BodyDimensions.from_stature(1.7)).names
     for subject, given in zip(setup.subjects, capture.subjects, strict=True):
         first = not subjects
-        pose_file = init_pose if first and init_pose else capture.path / given.init if given.init else None
-        init = first_pose(capture, names, pose_file, first_frame) if first or pose_file else None
+        init_file, body_file = (capture.path / name if name else None for name in (given.init, given.body))
+        if first:
+            init_file, body_file = options.init_pose or init_file, options.body or body_file
+        init = first_pose(capture, names, init_file, first_frame) if first or init_file else None
         frame = subject.init_frame
         if init is not None:
-            where = pose_file or capture.init_keypoints
+            where = init_file or capture.init_keypoints
             if not ((setup.volume.lower <= init.center) & (init.center <= setup.volume.upper)).all():
                 raise CaptureError(
                     f"{where}: the body is at {init.center.round(2).tolist()}, outside the working volume "
@@ -62,7 +66,6 @@ def recording_setup(capture: Capture, init_pose: Path | None, body: Path | None,
             frame = first_frame if init.frame is None else init.frame
             if init.frame is not None and init.frame >= capture.frame_count:
                 raise CaptureError(f"{where}: frame = {frame} is past the capture's last, {capture.frame_count - 1}")
-        body_file = body if first and body else capture.path / given.body if given.body else None
         known = read_body(body_file, setup.up) if body_file else None
         subjects.append(replace(subject, init_frame=frame, init=init, body=known))
     frames = {s.init_frame for s in subjects if s.init is not None}
@@ -71,14 +74,14 @@ def recording_setup(capture: Capture, init_pose: Path | None, body: Path | None,
     return replace(setup, subjects=tuple(subjects))
 
 
-def reduce_images(setup: Setup, capture: Capture, person_pixels: int) -> tuple[Setup, Capture]:
-    """Return a capture whose images are reduced where the person is larger than ``person_pixels``, and the setup with
-    its cameras; see :attr:`tk.settings.Settings.person_pixels`. A warning of the capture reports it."""
-    heights = setup.person_pixels()
+def reduce_images(capture: Capture, person_pixels: int) -> Capture:
+    """Return a capture whose images are reduced where the person is larger than ``person_pixels``; see
+    :attr:`tk.settings.Settings.person_pixels`. A warning of the capture reports it."""
+    heights = capture.setup().person_pixels()
     factors = np.maximum(heights // person_pixels, 1).astype(int) if person_pixels else np.ones(len(heights), int)
     if factors.max() == 1:
-        return setup, capture
-    names, sizes = np.array(setup.rig.names), []
+        return capture
+    names, sizes = np.array(capture.rig.names), []
     for factor in np.unique(factors[factors > 1]):
         chosen = factors == factor
         who = "all cameras" if chosen.all() else ", ".join(names[chosen])
@@ -86,8 +89,7 @@ def reduce_images(setup: Setup, capture: Capture, person_pixels: int) -> tuple[S
         tall = f"{low} px" if low == high else f"{low} to {high} px"
         sizes.append(f"{who} at 1/{factor} (the person is about {tall} tall)")
     line = f"{capture.path}: images are read at a reduced size: {', '.join(sizes)}; person_pixels = 0: at full size"
-    small = replace(capture.reduced(factors.tolist()), warnings=(*capture.warnings, line))
-    return replace(setup, rig=small.rig), small
+    return replace(capture.reduced(factors.tolist()), warnings=(*capture.warnings, line))
 
 
 def choose_frames(source: Source, frames: tuple[int, int | None], note: Callable[[str], None]) -> tuple[int, int]:
@@ -113,19 +115,17 @@ def choose_frames(source: Source, frames: tuple[int, int | None], note: Callable
 
 @dataclass(frozen=True)
 class Plan:
-    """What is tracked, and by which trackers.
+    """A task, and how it is done.
 
     Attributes:
-        setup, source, settings: the scene, its images, and all settings.
+        task: what is tracked.
         observations: the source's frames, segmented.
         tracker: the first person's, not started yet.
         first: frame of the initialisation.
         begin, stop: range of frames written, stop exclusive; None: until the source ends.
     """
 
-    setup: Setup
-    source: Source
-    settings: Settings
+    task: Task
     observations: Observations
     tracker: Tracker
     first: int
@@ -139,7 +139,7 @@ class Plan:
 
     def meta(self) -> ResultMeta:
         """Return what the result says about itself."""
-        tracker, setup = self.tracker, self.setup
+        tracker, task, setup = self.tracker, self.task, self.task.setup
         return ResultMeta(
             pose_names=tracker.pose_names,
             pose_units=tracker.pose_units,
@@ -147,26 +147,22 @@ class Plan:
             timing_stages=(*TIMING_STAGES, *tracker.timing_stages, "total"),
             fps=setup.fps,
             up=setup.up,
-            capture=self.source.name,
+            capture=task.source.name,
             method=tracker.method,
-            seed=self.settings.seed,
-            config_toml=to_toml(self.settings),
+            seed=task.settings.seed,
+            config_toml=to_toml(task.settings),
             sigma=tracker.reports_sigma,
             residual_cameras=setup.rig.names if tracker.reports_sigma else (),
-            mask_sources=sources_of_masks(self.source) if tracker.reports_sigma else (),
+            mask_sources=sources_of_masks(task.source) if tracker.reports_sigma else (),
             segment_names=SEGMENTS if tracker.has_segments else (),
             feet=tracker.has_segments,
             angles=tuple(JointAngles(a.joint, a.names, a.convention) for a in ANGLES) if tracker.has_segments else (),
             objective_kind=tracker.objective_kind,
         )
 
-    def another_tracker(self) -> Tracker:
-        """Return a tracker of the same method for another person."""
-        return type(self.tracker).of(self.setup, self.settings)
-
-    def origin(self, store_hull: bool) -> dict[str, str]:
+    def origin(self) -> dict[str, str]:
         """Return what else must agree when a run is resumed, by the name that a user knows."""
-        subjects, source = self.setup.subjects, self.source
+        options, setup, source = self.task.options, self.task.setup, self.task.source
 
         def hashed(given: Sequence[object]) -> str:
             known = any(value is not None for value in given)
@@ -175,34 +171,29 @@ class Plan:
         return {
             "first frame": str(self.begin),
             "frame of the initial pose": str(self.first),
-            "given body (its hash)": hashed([s.body for s in subjects]),
-            "cameras": ", ".join(self.setup.rig.names),
-            "size of the images": ", ".join("full" if k == 1 else f"1/{k}" for k in self.setup.rig.reductions),
+            "given body (its hash)": hashed([s.body for s in setup.subjects]),
+            "cameras": ", ".join(setup.rig.names),
+            "size of the images": ", ".join("full" if k == 1 else f"1/{k}" for k in setup.rig.reductions),
             "masks": source.masks_from if source.has_masks else mask_source(source),
-            "initial pose (its hash)": hashed([s.init for s in subjects]),
-            "stored hull": "yes" if store_hull else "no",
+            "initial pose (its hash)": hashed([s.init for s in setup.subjects]),
+            "stored hull": "yes" if options.store_hull else "no",
+            "people": describe(options.people),
         }
 
 
 @contextmanager
-def open_plan(
-    setup: Setup,
-    source: Source,
-    settings: Settings,
-    note: Callable[[str], None],
-    method: str,
-    frames: tuple[int, int | None],
-) -> Iterator[Plan]:
-    """Make trackers and open the source's observations; arguments as of :func:`tk.run.session.track_source`.
+def open_plan(task: Task, note: Callable[[str], None]) -> Iterator[Plan]:
+    """Make trackers and open the source's observations; ``note`` receives lines for the user.
 
     Raises:
-        TkError: the arguments are inconsistent with each other or with the source.
+        TkError: the options are inconsistent with each other or with the source.
     """
-    kind = tracker_class(method)
+    setup, source, frames = task.setup, task.source, task.options.frames
+    kind = tracker_class(task.options.method)
     # the process of the observations starts while this one makes tables and compiles
-    with open_observations(setup, source, settings, note, kind.needs_images) as observations:
-        _LOG.info("preparing the %s tracker", method)
-        tracker = kind.of(setup, settings)
+    with open_observations(task, note, kind.needs_images) as observations:
+        _LOG.info("preparing the %s tracker", task.options.method)
+        tracker = kind.of(setup, task.settings)
         start, stop = max(frames[0], source.first_frame), frames[1]
         if source.frame_count is not None:
             start, stop = choose_frames(source, frames, note)
@@ -217,4 +208,4 @@ def open_plan(
             )
         if start < first:
             note(f"frames before {first} are left out: the subject is found in frame {first} and followed forwards")
-        yield Plan(setup, source, settings, observations, tracker, first, max(start, first), stop)
+        yield Plan(task, observations, tracker, first, max(start, first), stop)

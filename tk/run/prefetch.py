@@ -42,11 +42,10 @@ from tk.errors import TkError, WorkerError
 from tk.io.captures.source import Source
 from tk.kernels.runtime import ensure_runtime
 from tk.model.cameras.camera import Rig
-from tk.model.setup import Setup
 from tk.run import worker
 from tk.run.segmentation import Labeller, make_labeller, mask_source, prepare_kernels
+from tk.run.task import Task
 from tk.segmenters import Segmenter
-from tk.settings import Settings
 from tk.trackers.protocol import Observation, Stopwatch
 
 Note = Callable[[str], None]
@@ -85,31 +84,27 @@ class Observations(Protocol):
     ) -> None: ...
 
 
-def open_observations(
-    setup: Setup, source: Source, settings: Settings, note: Note, keep_images: bool = True
-) -> Observations:
+def open_observations(task: Task, note: Note, keep_images: bool = True) -> Observations:
     """Return the observations of a source, made ahead if there is a second core and ``settings.ahead`` is not 0.
 
     Args:
-        setup: the cameras and the working volume.
-        source: the images.
-        settings: how frames are segmented, and how many frames ahead.
+        task: its source yields the frames.
         note: called with each line that the user should read.
         keep_images: False leaves the images empty, (C, 0, 0, 3), and no uncertain pixels, for a tracker of masks alone.
 
     Raises:
         CaptureError: there is nothing to make masks from.
     """
-    mask_source(source)  # before a process is started
-    if settings.ahead and worker.cores() > 1 and sys.executable and _can_be_sent(source.segmenter):
+    mask_source(task.source)  # before a process is started
+    if task.settings.ahead and worker.cores() > 1 and sys.executable and _can_be_sent(task.source.segmenter):
         try:
-            return Ahead(setup, source, settings, note, keep_images)
+            return Ahead(task, note, keep_images)
         except OSError as error:  # ulimit -f, -n or -v
             note(
                 f"no memory can be shared with another process ({error.strerror}): frames are made one after the other"
             )
     worker.dismiss()
-    return Serial(setup, source, settings, note, keep_images)
+    return Serial(task, note, keep_images)
 
 
 def _can_be_sent(segmenter: Segmenter | None) -> bool:
@@ -145,15 +140,13 @@ def observe(
 class Serial:
     """Observations that are made when the tracker asks for them."""
 
-    setup: Setup
-    source: Source
-    settings: Settings
+    task: Task
     note: Note
     keep_images: bool = True
 
     def frames(self, start: int, stop: int | None) -> Iterator[Observed]:
-        label = make_labeller(self.setup, self.source, self.settings, self.note)
-        for observation, watch in observe(self.source, label, (start, stop), self.keep_images):
+        label = make_labeller(self.task, self.note)
+        for observation, watch in observe(self.task.source, label, (start, stop), self.keep_images):
             yield observation, {**watch.laps, "wait": sum(watch.laps.values())}
 
     def __enter__(self) -> Serial:
@@ -167,12 +160,10 @@ class Serial:
 
 
 @dataclass(frozen=True)
-class _Task:
+class _Order:
     """What the process needs first; the span of frames follows."""
 
-    setup: Setup
-    source: Source
-    settings: Settings
+    task: Task
     keep_images: bool
     slots: int
 
@@ -235,10 +226,10 @@ class Ahead:
     it receives, the tracker gives the process a free slot, so the process always has ``settings.ahead`` of them.
     """
 
-    def __init__(self, setup: Setup, source: Source, settings: Settings, note: Note, keep_images: bool = True) -> None:
-        self._where, self._note = source.where, note
-        self._layout = _Layout(setup.rig, keep_images)
-        slots = max(min(settings.ahead, _AHEAD_BYTES // self._layout.bytes), 1)
+    def __init__(self, task: Task, note: Note, keep_images: bool = True) -> None:
+        self._where, self._note = task.source.where, note
+        self._layout = _Layout(task.setup.rig, keep_images)
+        slots = max(min(task.settings.ahead, _AHEAD_BYTES // self._layout.bytes), 1)
         size = (slots + _SPARE) * self._layout.bytes  # the system provides memory where it is written
         handle = _nameless_file(size)
         self._memory = mmap.mmap(handle, size)
@@ -253,7 +244,7 @@ class Ahead:
         finally:
             os.close(handle)
         self._connection = Connection(started.end.detach())
-        self._send(_Task(setup, source, settings, keep_images, slots))
+        self._send(_Order(task, keep_images, slots))
 
     def frames(self, start: int, stop: int | None) -> Iterator[Observed]:
         self._begun = True
@@ -348,11 +339,11 @@ class Ahead:
 class _Slots:
     """The process's end of the shared memory."""
 
-    def __init__(self, tracker: Connection, memory: mmap.mmap, task: _Task) -> None:
+    def __init__(self, tracker: Connection, memory: mmap.mmap, order: _Order) -> None:
         self._tracker = tracker
         self._memory = memory
-        self._layout = _Layout(task.setup.rig, task.keep_images)
-        self._free = list(range(task.slots))
+        self._layout = _Layout(order.task.setup.rig, order.keep_images)
+        self._free = list(range(order.slots))
 
     def put(self, observation: Observation, watch: Stopwatch) -> None:
         """Hand a frame over; waits for a free slot."""
@@ -413,10 +404,10 @@ def _warm_up(end: socket.socket) -> None:
 
 
 def _serve(tracker: Connection, memory: mmap.mmap) -> None:
-    task: _Task = tracker.recv()
-    label = make_labeller(task.setup, task.source, task.settings, tracker.send)
-    slots = _Slots(tracker, memory, task)
+    order: _Order = tracker.recv()
+    label = make_labeller(order.task, tracker.send)
+    slots = _Slots(tracker, memory, order)
     span: tuple[int, int | None] = tracker.recv()
-    for observation, watch in observe(task.source, label, span, task.keep_images):
+    for observation, watch in observe(order.task.source, label, span, order.keep_images):
         slots.put(observation, watch)
     tracker.send(None)

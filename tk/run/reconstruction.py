@@ -15,8 +15,9 @@ from tk.model.cameras.volume import VoxelGrid
 from tk.model.hull.hull import VisualHull
 from tk.run.plan import choose_frames
 from tk.run.reporter import Reporter
-from tk.run.segmentation import make_segmenter
+from tk.run.segmentation import make_labeller
 from tk.run.session import points_of
+from tk.run.task import Task
 from tk.settings import Settings
 
 
@@ -61,14 +62,14 @@ def reconstruct(
     for file in files:
         if file.exists():
             check_output(file, PLY, force, capture=capture.path, error=ResultError)
-    segment = make_segmenter(capture.setup(), capture, config, reporter.note)
+    label = make_labeller(Task.of(capture, config), reporter.note)
     hull = VisualHull(capture.rig, VoxelGrid.cover(capture.volume, config.voxels))
     reporter.begin(stop - start, 0)
 
     def hulls() -> Iterator[tuple[int, HullPoints]]:
         with capture.frames(start, stop) as reader:
             for frame in reader:
-                hull.update(segment(frame))
+                hull.update(label(frame).masks)
                 points: HullPoints = points_of(hull.surface(frame.images))
                 if ply is not None:
                     write_ply(ply_path(ply, frame.index), points.positions, points.colors)

@@ -27,6 +27,7 @@ from tk.model.cues.ray_costs import Evidence, RayGrid, residual_of
 from tk.model.masks.silhouettes import Views
 from tk.run.plan import reduce_images
 from tk.run.prefetch import open_observations
+from tk.run.task import Task
 from tk.settings import Settings
 from tk.threads import one_thread
 from tk.trackers.bodies import body_and_poses
@@ -134,9 +135,9 @@ def refine_capture(
             f"{result}: was tracked with the cameras {', '.join(found.cameras.rig.names)}; open the same",
             hint="name them with --cameras",
         )
-    setup, source = reduce_images(capture.setup(), capture, config.person_pixels)
-    world, store = TrackerFrame.of(setup.rig, capture.up), MaskStore()
-    with open_observations(setup, source, config, note, keep_images=False) as observations:
+    source = reduce_images(capture, config.person_pixels)
+    world, store = TrackerFrame.of(source.rig, source.up), MaskStore()
+    with open_observations(Task.of(source, config), note, keep_images=False) as observations:
         for observation, _ in observations.frames(int(found.frames.min()), int(found.frames.max()) + 1):
             store.put(observation.index, observation.masks)
     poses = TrackedPoses(found.frames, world.poses_in(tracked[1]), found.has_pose)

@@ -14,13 +14,10 @@ from tk.io.captures.source import Source
 from tk.model.masks.background import median_plate
 from tk.model.masks.foreground import CollinearityForeground, Foreground
 from tk.model.masks.mog2 import Mog2Foreground
-from tk.model.setup import Setup
 from tk.run.learned_masks import MASK_SOURCES, LearnedMasks
+from tk.run.task import Task
 from tk.segmenters import INSTALL, load, names
-from tk.settings import Settings
 from tk.threads import one_thread
-
-Segmenter = Callable[[FrameSet], NDArray[np.uint8]]
 
 
 class Labels(NamedTuple):
@@ -86,23 +83,18 @@ def sources_of_masks(source: Source) -> tuple[str, ...]:
     return MASK_SOURCES if mask_source(source).startswith(_SEGMENTER) else ()
 
 
-def make_segmenter(setup: Setup, source: Source, settings: Settings, note: Callable[[str], None]) -> Segmenter:
-    """Return a function from a frame set to its masks, from where :func:`mask_source` says."""
-    label = make_labeller(setup, source, settings, note)
-    return lambda frame: label(frame).masks
-
-
-def make_labeller(setup: Setup, source: Source, settings: Settings, note: Callable[[str], None]) -> Labeller:
-    """Return a function from a frame set to its masks, their uncertain pixels, and their sources.
+def make_labeller(task: Task, note: Callable[[str], None]) -> Labeller:
+    """Return a function from a frame set to its masks, their uncertain pixels, and their sources, from where
+    :func:`mask_source` says; ``note`` receives lines for the user.
 
     Raises:
         CaptureError: there is nothing to make masks from, or the median is not the empty scene.
         ConfigError: the segmenter cannot be loaded.
     """
-    if mask_source(source) in (_GIVEN, _SCENE):
-        return _labeller(setup, source, settings, note)  # no matrix products in it; SciPy takes long to import
+    if mask_source(task.source) in (_GIVEN, _SCENE):
+        return _labeller(task, note)  # no matrix products in it; SciPy takes long to import
     with one_thread():
-        return one_thread()(_labeller(setup, source, settings, note))
+        return one_thread()(_labeller(task, note))
 
 
 def prepare_kernels() -> None:
@@ -113,7 +105,8 @@ def prepare_kernels() -> None:
     CollinearityForeground.learn([scene], (64, 64), [(64, 64)]).label(person)
 
 
-def _labeller(setup: Setup, source: Source, settings: Settings, note: Callable[[str], None]) -> Labeller:
+def _labeller(task: Task, note: Callable[[str], None]) -> Labeller:
+    setup, source = task.setup, task.source
     origin = mask_source(source)
     if origin == _GIVEN:
         return _given_masks
@@ -123,37 +116,40 @@ def _labeller(setup: Setup, source: Source, settings: Settings, note: Callable[[
         from tk.segmenters.people_masks import PeopleMasks  # SciPy, which takes a second to import
 
         made = PeopleMasks(source.segmenter or load(name), name, setup.rig, setup.volume)
-        learned = LearnedMasks(setup, source, settings, made)
+        learned = LearnedMasks(task, made)
         if reason := learned.why_throughout():
             note(f"{source.where}: the segmenter makes the masks of every frame, which takes long: {reason}")
         return lambda frame: Labels(*learned.label(frame))
-    foreground = _learn_median(setup, source, settings, note) if origin == _MEDIAN else None
-    if foreground is None:
+    if origin == _MEDIAN:
+        foreground = _learn_median(task, note)
+    else:
         clips = source.background()
         assert clips is not None
-        foreground = _learn(setup, settings, clips)
+        foreground = _learn(task, clips)
     return lambda frame: Labels(*foreground.label(frame.images))
 
 
-def _learn(setup: Setup, settings: Settings, clips: Sequence[NDArray[np.uint8]]) -> Foreground:
+def _learn(task: Task, clips: Sequence[NDArray[np.uint8]]) -> Foreground:
+    setup, settings = task.setup, task.settings
     sizes = [(camera.width, camera.height) for camera in setup.rig]
     if settings.segmentation == "mog2":
         return Mog2Foreground.learn(clips, setup.rig.frame_shape, sizes)
     return CollinearityForeground.learn(clips, setup.rig.frame_shape, sizes, settings.foreground)
 
 
-def _learn_median(setup: Setup, source: Source, settings: Settings, note: Callable[[str], None]) -> Foreground:
+def _learn_median(task: Task, note: Callable[[str], None]) -> Foreground:
     """Return a segmentation against the median of the recording, after a check that the median is the empty scene.
 
     Raises:
         CaptureError: no person differs from the median, or the length of the source is unknown.
     """
+    setup, source = task.setup, task.source
     if source.frame_count is None:
         raise CaptureError(f"{source.where}: the median needs a recording; {_WAYS_OUT}")
     step = -(-source.frame_count // PLATE_FRAMES)
     with source.frames() as frames:
         samples = [frame.images.copy() for frame in frames if frame.index % step == 0]
-    foreground = _learn(setup, settings, median_plate(samples, [(c.width, c.height) for c in setup.rig]))
+    foreground = _learn(task, median_plate(samples, [(c.width, c.height) for c in setup.rig]))
     masks = np.array([foreground.label(images)[0] for images in samples]) > 0  # (K, C, H, W)
     from tk.model.hull.coarse import CoarseHull  # SciPy
 

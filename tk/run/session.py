@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from tk.errors import CaptureError, ResultError, TkError
 from tk.io.captures.capture import Capture
 from tk.io.captures.mask_store import MaskStores
-from tk.io.captures.source import Source
 from tk.io.results.data import HullPoints, Value
 from tk.io.results.files import check_result_path
 from tk.io.results.reader import as_damage_error, read_people, read_result
@@ -25,14 +24,12 @@ from tk.io.results.revision import revise_result
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
 from tk.model.hull.hull import HullSurface
-from tk.model.setup import Setup
-from tk.run.choice import Choice, describe
 from tk.run.offline import REFINED, finish, report_suspect, report_unknown
 from tk.run.people import People, Tracked
-from tk.run.plan import Plan, open_plan, recording_setup, reduce_images
+from tk.run.plan import Plan, open_plan, recording_task
 from tk.run.prefetch import Observed
 from tk.run.reporter import Reporter
-from tk.settings import Settings
+from tk.run.task import RecordingOptions, Task
 from tk.threads import one_thread
 from tk.trackers.protocol import Estimate, Observation, shows_person, two_pass
 
@@ -81,87 +78,49 @@ class Summary:
 def track(
     capture: Capture,
     output: Path,
-    settings: Settings,
+    options: RecordingOptions,
     reporter: Reporter,
-    method: str = "region",
-    frames: tuple[int, int | None] = (0, None),
-    init_pose: Path | None = None,
     resume: bool = False,
-    store_hull: bool = False,
-    body: Path | None = None,
-    causal: bool = False,
     force: bool = False,
-    people: Choice = "auto",
 ) -> Summary:
-    """Track a recording, see :func:`track_source`.
-
-    Args:
-        capture: the recording; other arguments as of :func:`track_source`.
-        init_pose, body: files, see :func:`tk.run.plan.recording_setup`.
+    """Track a recording and write the result, see :func:`track_task`.
 
     Raises:
         TkError: bad input; every frame finished before it is in the file.
     """
     masks = Path(capture.masks) if capture.masks not in ("auto", "none", "median") else None
-    check_result_path(output, force, resume, [init_pose, capture.init_keypoints, body, masks], capture.path)
-    settings = replace(settings, resample=capture.resampled)  # stored, so that the capture is opened in the same way
-    setup = recording_setup(capture, init_pose, body, frames[0])
-    setup, capture = reduce_images(setup, capture, settings.person_pixels)
-    notes = capture.warnings
-    return track_source(
-        setup, capture, output, settings, reporter, method, frames, resume, store_hull, causal, force, notes, people
-    )
+    inputs = [options.init_pose, capture.init_keypoints, options.body, masks]
+    check_result_path(output, force, resume, inputs, capture.path)
+    return track_task(recording_task(capture, options), output, reporter, resume, force)
 
 
-def track_source(
-    setup: Setup,
-    source: Source,
-    output: Path,
-    settings: Settings,
-    reporter: Reporter,
-    method: str = "region",
-    frames: tuple[int, int | None] = (0, None),
-    resume: bool = False,
-    store_hull: bool = False,
-    causal: bool = False,
-    force: bool = False,
-    notes: tuple[str, ...] = (),
-    people: Choice = "auto",
-) -> Summary:
+def track_task(task: Task, output: Path, reporter: Reporter, resume: bool = False, force: bool = False) -> Summary:
     """Track the people in a scene and write the result, frame by frame.
 
-    People are found in the frame of the initialisation and tracked forwards; frames before ``frames`` are tracked but
-    not written. Ctrl-C ends the run with all finished frames in the file, closed and ready for ``resume``.
+    People are found in the frame of the initialisation and tracked forwards; frames before ``task.options.frames`` are
+    tracked but not written. Ctrl-C ends the run with all finished frames in the file, closed and ready for ``resume``.
 
     Args:
-        setup: the scene.
-        source: the images.
+        task: the scene, the images, and the options.
         output: the result file.
-        settings: all settings.
         reporter: receives notes and progress.
-        method: name of the tracker.
-        frames: range of frames to write, end exclusive (None: to the end of the source).
         resume: continue where an earlier run of the same command stopped.
-        store_hull: store the hull's surface in the result, too.
-        causal: stop after the first pass, in which no frame depends on later ones.
         force: replace an existing result.
-        notes: notes about the input, for reporter and result.
-        people: "auto": one person, the first by :func:`tk.model.people.order_people`; "all": everybody in the working
-            volume, also who enters later; or the numbers of people in that order.
 
     Raises:
         TkError: bad input; every frame finished before it is in the file.
     """
     check_result_path(output, force, resume)
     said: list[str] = []
+    causal = task.options.causal
 
     def note(text: str) -> None:
         said.append(text)
         reporter.note(text)
 
-    for text in notes:
+    for text in task.notes:
         note(text)
-    with open_plan(setup, source, settings, note, method, frames) as plan:
+    with open_plan(task, note) as plan:
         meta = plan.meta()
         writer, done = ResultWriter.resume(output, meta) if resume else (ResultWriter.create(output, meta), 0)
         again = not causal and plan.tracker.has_second_pass  # the second pass needs the masks
@@ -169,8 +128,7 @@ def track_source(
         if not (done or again):
             stores.remove()  # of a stopped run; with a second pass, the first frame replaces them
         masks = stores if again else None
-        origin = {**plan.origin(store_hull), "people": describe(people)}
-        run = _Run(plan, people, note, _Output(writer, done, origin, store_hull), masks)
+        run = _Run(plan, note, _Output(writer, done, plan.origin()), masks)
         started = time.perf_counter()
         interrupted = False
         try:
@@ -178,14 +136,13 @@ def track_source(
                 reporter.begin(plan.total, min(done, plan.total) if plan.total else done)
                 for frame, estimates in enumerate(run.frames(), plan.begin + done):
                     reporter.advance(frame, estimates[0] if estimates else None)
-            if run.tracked or run.restore_unfinished(output, causal):
+            if run.tracked or run.restore_unfinished(output):
                 if lines := run.people.report():  # a damaged image may be the cause
-                    lines = [*source.damaged(plan.begin + done + run.tracked), *lines]
+                    lines = [*task.source.damaged(plan.begin + done + run.tracked), *lines]
                 for line in lines:
                     note(line)
                 with one_thread():
-                    contacts = run.people.contacts
-                    finish(output, plan, run.people.members, contacts, masks, note, reporter.within, run.finished)
+                    finish(output, task, run.people, masks, note, reporter.within, run.finished)
                 if said:
                     revise_result(output, notes=said)
             stores.remove()
@@ -200,22 +157,17 @@ def track_source(
         return Summary(np.concatenate(status), time.perf_counter() - started, run.tracked, interrupted, len(status))
 
 
-def estimates(
-    setup: Setup,
-    source: Source,
-    settings: Settings,
-    note: Callable[[str], None] = lambda _: None,
-    method: str = "region",
-    frames: tuple[int, int | None] = (0, None),
-    people: Choice = "auto",
-) -> Iterator[Estimate]:
+def estimates(task: Task, note: Callable[[str], None] = lambda _: None) -> Iterator[Estimate]:
     """Track the people in a scene and yield their estimates, as the first pass finds them, frame by frame and in the
-    order of the people's numbers. No file is written.
+    order of the people's numbers. No file is written; ``note`` receives lines for the user.
 
-    Arguments and errors are those of :func:`track_source`.
+    Raises:
+        TkError: bad input.
     """
-    with open_plan(setup, source, settings, note, method, frames) as plan:
-        run = _Run(plan, people, note)
+    for line in task.notes:
+        note(line)
+    with open_plan(task, note) as plan:
+        run = _Run(plan, note)
         unknown: defaultdict[int, list[int]] = defaultdict(list)  # by person
         suspect: defaultdict[int, list[int]] = defaultdict(list)
         for estimate in chain.from_iterable(run.frames()):
@@ -255,7 +207,6 @@ class _Output:
     writer: ResultWriter
     done: int
     origin: Mapping[str, str]
-    store_hull: bool
 
     def check(self) -> None:
         """Raise ResultError if the earlier run had other inputs or settings."""
@@ -284,7 +235,6 @@ class _Run:
     def __init__(
         self,
         plan: Plan,
-        people: Choice,
         note: Callable[[str], None],
         output: _Output | None = None,
         masks: MaskStores | None = None,
@@ -293,7 +243,7 @@ class _Run:
         self.tracked = 0
         self._held: list[dict[int, dict[str, ArrayLike]]] = []  # rows of frames that are not in the file yet
         self.finished: Container[int] = ()
-        self.people = People(plan.setup, plan.tracker, plan.another_tracker, people, note)
+        self.people = People(plan.task, plan.tracker, note)
 
     def frames(self) -> Iterator[tuple[Estimate, ...]]:
         """Start or restore the trackers, step them to the end and yield the estimates of each frame's people; they are
@@ -319,7 +269,7 @@ class _Run:
         plan.tracker.prepare()
         yield from self._step_through(self._started(observations, count))
         if not self.people.members:
-            raise CaptureError(f"{plan.source.where}: nobody could be tracked: {self.people.refusal}")
+            raise CaptureError(f"{plan.task.source.where}: nobody could be tracked: {self.people.refusal}")
 
     def _started(self, observations: Iterator[Observed], count: int) -> Iterator[Observed]:
         """Yield the observations; start the trackers before the first frame with somebody in the volume is yielded.
@@ -330,7 +280,7 @@ class _Run:
         """
         opening: list[Observed] = []
         observations = _fill(opening, observations, count)
-        source, stop = self.plan.source, self.plan.stop
+        source, stop = self.plan.task.source, self.plan.stop
         while opening and (stop is None or opening[0][0].index < stop):
             try:
                 with one_thread():
@@ -348,22 +298,22 @@ class _Run:
 
     def _opening_frames(self) -> int:
         """Return the number of frames that the body is fitted to: fewer where the images are large."""
-        plan = self.plan
-        count, rig = plan.tracker.opening_frames, plan.setup.rig
+        task, count = self.plan.task, self.plan.tracker.opening_frames
+        rig = task.setup.rig
         held = 5 * len(rig) * math.prod(rig.frame_shape)  # bytes of a frame: image, mask and uncertain pixels
         fewer = min(count, max(_OPENING_BYTES // held, _LEAST_OPENING))
         if fewer < count:
             self._note(
-                f"{plan.source.where}: the images are large; the body is fitted to {fewer} frames instead of {count}"
+                f"{task.source.where}: the images are large; the body is fitted to {fewer} frames instead of {count}"
             )
         return fewer
 
-    def restore_unfinished(self, path: Path, causal: bool) -> bool:
+    def restore_unfinished(self, path: Path) -> bool:
         """Restore the trackers if all frames are written but the result is not finished; return whether that is so."""
         output, tracker = self.output, self.plan.tracker
         if output is None or not output.done or not tracker.has_segments:
             return False
-        one_pass = causal or not tracker.has_second_pass
+        one_pass = self.plan.task.options.causal or not tracker.has_second_pass
         self.finished = {
             person
             for person, (model, result) in enumerate(zip(output.writer.models, read_result(path).people, strict=True))
@@ -397,7 +347,7 @@ class _Run:
                 estimates = tuple(replace(e, timing={**laps, **e.timing, "total": total}) for e in estimates)
                 due = not output or stepped - written > WRITE_EVERY_S
                 if output:
-                    self._held.append({e.person: _row(e, output.store_hull) for e in estimates})
+                    self._held.append({e.person: _row(e, self.plan.task.options.store_hull) for e in estimates})
                     if self.people.members:
                         self._write(output, due)
                 finished.append(estimates)

@@ -14,14 +14,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from scripts.synthetic.keypoints import write_keypoints
-from tests.conftest import QUICK, Silent, Tk, refused
+from tests.conftest import QUICK, Tk, refused, track
 from tk.errors import CaptureError
 from tk.io import settings_file
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.captures.keypoints import LAYOUTS, keypoint_pose, read_people
 from tk.io.results.reader import read_joints, read_result
 from tk.model.body.skeleton import JOINTS
-from tk.run.session import track
 
 FRAME = 4
 
@@ -87,7 +86,7 @@ def test_tracking_starts_from_keypoints(detected: Path, tiny: Path, tmp_path: Pa
     for name, init in (("settings", None), ("option", detected)):
         capture = opened if init is None else replace(opened, init_keypoints=None)
         config = settings_file.from_toml(QUICK)
-        track(capture, tmp_path / f"{name}.h5", config, Silent(), frames=(FRAME, 8), init_pose=init, causal=True)
+        track(capture, tmp_path / f"{name}.h5", config, frames=(FRAME, 8), init_pose=init, causal=True)
         results.append(read_result(tmp_path / f"{name}.h5"))
     np.testing.assert_array_equal(results[0].pose, results[1].pose)
     truth = read_joints(tiny / "truth.h5").positions[results[0].frames]
