@@ -25,7 +25,7 @@ from tk.model.masks.silhouettes import Pyramid, Views
 from tk.optim import gauss_newton
 from tk.settings import Settings
 from tk.trackers.bodies import body_and_poses
-from tk.trackers.contour_tracker import LINE_SEARCH, SCREEN_ROWS, SOLVER
+from tk.trackers.contour_finder import LINE_SEARCH, SCREEN_ROWS, SOLVER
 from tk.trackers.limb_search import NEARBY
 
 Float = np.ndarray

@@ -46,7 +46,7 @@ def pieces(path: str, masks: str) -> None:
     from tk.run.plan import open_plan, recording_task
     from tk.run.task import RecordingOptions
     from tk.threads import one_thread
-    from tk.trackers import contour_tracker
+    from tk.trackers import contour_finder
 
     recording = tk.io.importers.open_recording(Path(path), None, masks)
     task = recording_task(recording, RecordingOptions())
@@ -82,10 +82,10 @@ def pieces(path: str, masks: str) -> None:
             PeopleFinder(setup.rig, setup.volume, setup.up).find(opening[0].masks, opening[0].uncertain)
             done("finding people")
             people = People(task, plan.tracker, lambda _: None)
-            find, fit = contour_tracker.find_person, contour_tracker.fit_body
+            find, fit = contour_finder.find_person, contour_finder.fit_body
             with (
-                mock.patch.object(contour_tracker, "find_person", timed("search for the pose", find)),
-                mock.patch.object(contour_tracker, "fit_body", timed("body fit", fit)),
+                mock.patch.object(contour_finder, "find_person", timed("search for the pose", find)),
+                mock.patch.object(contour_finder, "fit_body", timed("body fit", fit)),
             ):
                 people.start(opening)
         for name in ("search for the pose", "body fit"):

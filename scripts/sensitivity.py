@@ -4,7 +4,7 @@
                                   [--method region] [--config FILE] [--limit 0.1]
 
 NAME is a constant, ``tk.model.cameras.bundle:SEGMENT_M``, or a setting, ``silhouette.lost_error``. A dot after a
-constant's name selects a field, a key or an index: ``tk.trackers.contour_tracker:LINE_SEARCH.robust_px``. Numbers of a
+constant's name selects a field, a key or an index: ``tk.trackers.contour_finder:LINE_SEARCH.robust_px``. Numbers of a
 whole table are multiplied together; integers are rounded.
 
 Each capture, which needs a ``truth.h5``, is tracked by ``tk track`` in a process of its own: once unchanged, then with

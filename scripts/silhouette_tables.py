@@ -28,7 +28,7 @@ from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.setup import Subject
 from tk.optim.gauss_newton import GaussNewtonSettings
 from tk.settings import SilhouetteSettings
-from tk.trackers.contour_tracker import LINE_SEARCH, SOLVER
+from tk.trackers.contour_finder import LINE_SEARCH, SOLVER
 from tk.trackers.protocol import Observation
 from tk.trackers.silhouette import SilhouetteTracker
 

@@ -257,6 +257,6 @@ def test_setting_out_of_range() -> None:
 
 def test_the_process_does_without_what_only_trackers_need() -> None:
     """SciPy alone would take it half a second at each start."""
-    heavy = "tk.trackers.contour_tracker", "scipy", "h5py", "av", "open3d"
+    heavy = "tk.trackers.contour_finder", "scipy", "h5py", "av", "open3d"
     code = f"import sys, tk.run.prefetch; print(*(name for name in {heavy} if name in sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split() == []

@@ -111,7 +111,7 @@ def test_hypothesis_whose_fitted_body_has_the_lower_residual_is_chosen(monkeypat
         TrajectoryHypothesis(tracker.world.poses_in(np.array([pose] * 4)), residual)
         for pose, residual in ((wrong, 0.10), (right, 0.105))
     ]
-    monkeypatch.setattr("tk.trackers.contour_tracker.find_person", lambda *_: hypotheses)
+    monkeypatch.setattr("tk.trackers.contour_finder.find_person", lambda *_: hypotheses)
     pose = tracker.world.poses_out(tracker.find(frames, Subject(STATURE)))
     assert error(SKELETON.joints(pose)[None], right[None])[0] < 0.02
 
@@ -164,7 +164,7 @@ def test_lower_hull_corrects_the_stature_of_wide_clothes(monkeypatch, hull_m: fl
     frame = Observation(0, np.zeros(0, np.uint8), masks)
     apparent = stature_of(tracker, [tracker.pyramid(frame)])
     monkeypatch.setattr(
-        "tk.trackers.contour_tracker.find_person", lambda *_: [TrajectoryHypothesis(np.zeros((1, 1)), 0.1)]
+        "tk.trackers.contour_finder.find_person", lambda *_: [TrajectoryHypothesis(np.zeros((1, 1)), 0.1)]
     )
     tracker.find([frame], Subject(hull_m=hull_m))
     assert apparent > 1.1 * STATURE

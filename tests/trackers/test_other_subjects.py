@@ -14,7 +14,7 @@ from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Views
 from tk.model.setup import Subject
 from tk.settings import SilhouetteSettings
-from tk.trackers.contour_tracker import LINE_SEARCH
+from tk.trackers.contour_finder import LINE_SEARCH
 from tk.trackers.region import RegionTracker
 
 RIG = ring_of_cameras(3, width=160, height=200)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tk.io.captures.capture import Capture
 from tk.model.cues.ray_costs import RayGrid
 from tk.model.people import LocatedPerson, PeopleFinder, order_people
-from tk.trackers.contour_tracker import CHOICE_ROWS
+from tk.trackers.contour_finder import CHOICE_ROWS
 from tk.trackers.protocol import Observation
 from tk.trackers.sharing import UNKNOWN_BY_HULLS, assign, cast_points
 

@@ -31,7 +31,7 @@ from tk.run.task import Task
 from tk.settings import Settings
 from tk.threads import one_thread
 from tk.trackers.bodies import body_and_poses
-from tk.trackers.contour_tracker import SCREEN_ROWS
+from tk.trackers.contour_finder import SCREEN_ROWS
 from tk.trackers.protocol import TwoPassTracker
 
 Float = NDArray[np.float64]

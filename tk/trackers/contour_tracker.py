@@ -1,89 +1,43 @@
-"""What the trackers that follow contours share: initialisation, body fit, limb search and recovery.
-
-masks → cleaned, scales → {contours → edgels along their normals → normal equations → step} × iterations × scales
-"""
+"""What the trackers that follow contours share: recovery, colours, and what a run stores of them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
-from tk.kernels.line_search import SearchSettings
-from tk.kernels.silhouette import descend, normal_equations
 from tk.model.body import gait_poses as gait
-from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.body_fit import INFORMATIVE_FRAMES, STATURE_DEVIATION, fit_body
-from tk.model.body.cone_body import ConeBody, build_cone_body
-from tk.model.body.initial_pose import rough_pose
-from tk.model.body.limb_candidates import Limb, limbs_of
-from tk.model.body.skeleton import build_skeleton, convert_poses
-from tk.model.body.stored_body import body_values, restore_body
-from tk.model.cameras.camera import Rig
-from tk.model.cameras.common_view import spread_out
-from tk.model.cameras.tracker_frame import TrackerFrame
+from tk.model.body.stored_body import restore_body
 from tk.model.cues.part_colors import PartColors, RenderedBody, color_bins
-from tk.model.cues.ray_costs import Evidence, RayGrid
-from tk.model.masks.silhouettes import Pyramid, Views
+from tk.model.masks.silhouettes import Pyramid
 from tk.model.setup import Subject
-from tk.optim import gauss_newton
-from tk.optim.gauss_newton import BatchSolution, GaussNewtonSettings, Prior
-from tk.settings import SilhouetteSettings
-from tk.trackers.initialisation import HEADINGS, PHASES, TrajectoryHypothesis, centroid, find_person, stature_of
-from tk.trackers.limb_search import LimbSearch
-from tk.trackers.protocol import Observation
+from tk.trackers.contour_finder import ContourFinder
+from tk.trackers.initialisation import HEADINGS, PHASES, centroid
+from tk.trackers.protocol import Estimate, Observation
 
 Float = NDArray[np.float64]
 
-# Standard deviation of the logarithm of a stature that was estimated from the silhouettes: their areas err by 6 %.
-ESTIMATED_STATURE_DEVIATION = 0.05
 # As long as a person stays lost, the search from the centroid of the silhouettes runs once in so many frames.
 RECOVER_EVERY = 3
 # Of the poses from which a lost person is searched for at the coarsest scale, one in RECOVERY_KEPT goes on to the finer
 # ones, if its residual is below HALVED times the current one: no finer scale halves a residual.
 RECOVERY_KEPT, HALVED = 4, 2.0
-# A given height is refused if the one that the silhouettes' area suggests differs by more than this factor. With true
-# heights the factor is 0.955 to 1.077 on nine recordings; children's proportions and wide clothes need more. A visual
-# hull that is lower by more than this shows a person who bends, so its height is no estimate of the stature.
-MOST_STATURE_RATIO = 1.35
-# Decrease of the cost, as a share of the person's pixels, at which another pose of a limb replaces the current one.
-# Between half and twice the value, the mean errors of dance and cube (60 frames) change by 0.01 cm at most.
-GAIN = 0.004
 # A recovered person who faces the other way than before must have a residual (E_S) lower by this at a half turn.
 # Half and twice the value change nothing in dance and cube (60 frames), where nobody is lost for long.
 FACING = 0.04
-# Cameras that the search at the start uses, at most. More cost time and hardly add a direction: with 8 of the 16
-# cameras of sixteen the mean error of the joints changes by less than 0.1 cm. The body is fitted with all of them.
-OPENING_CAMERAS = 8
-# Rows of the grid of rays: to screen many candidates of a limb, and to choose among few poses.
-SCREEN_ROWS, CHOICE_ROWS = 54, 96
 # Probability that a ray contradicts the person's own body: the residual (E_S) of the development captures.
 WRONG = 0.1
 
-LINE_SEARCH = SearchSettings()
-# Half this tolerance, or none, leaves the mean joint error on eight captures unchanged to 0.02 cm; twice as much makes
-# fast arms worse by 0.1 cm.
-SOLVER = GaussNewtonSettings(scales=3, relaxation=1.6, tolerance=0.012)
 
+class ContourTracker(ContourFinder, ABC):
+    """Base class of the region and the silhouette tracker.
 
-class ContourTracker:
-    """Base class of the region and the silhouette tracker: initialisation, body fit, limb search, recovery.
-
-    The tracker has its own world frame, derived from the cameras. :attr:`body` and all poses are in it, except those
-    that go in or out by the protocol (:class:`~tk.trackers.protocol.Tracker`), which are in the capture's world.
-
-    Args:
-        rig: the cameras.
-        up: the upward direction of their world, see :func:`tk.model.cameras.up.up_vector`.
-        config: see :class:`~tk.settings.SilhouetteSettings`.
-        fps: frames per second.
-        line_search: how edges are searched along the contours' normals.
-        solver: scales and iterations of Gauss-Newton.
+    All poses are in the tracker's own world, except those that go in or out by the protocol
+    (:class:`~tk.trackers.protocol.Tracker`), which are in the capture's world.
     """
 
     objective_kind = "E_S"
@@ -94,181 +48,23 @@ class ContourTracker:
     has_second_pass = False
     tracks_among_others = True
 
-    def __init__(
-        self,
-        rig: Rig,
-        up: str,
-        config: SilhouetteSettings,
-        fps: float = 15.0,
-        line_search: SearchSettings = LINE_SEARCH,
-        solver: GaussNewtonSettings = SOLVER,
-    ) -> None:
-        self.contours, self.line_search, self.solver = config, line_search, solver
-        self.rig, self.up, self.fps = rig, up, fps
-        self.world = TrackerFrame.of(rig, up)
-        self.views = Views(self.world.rig)
-        self.screen, self.choice = (RayGrid(self.world.rig, rows) for rows in (SCREEN_ROWS, CHOICE_ROWS))
-        skeleton = build_skeleton(BodyDimensions.from_stature(1.7))
-        self.pose_names, self.pose_units = skeleton.names, skeleton.units
-        self._body: ConeBody | None = None
-        self._lost_for = 0
-        self.colors: PartColors
-        self.limbs: tuple[Limb, ...]
+    _lost_for: int  # consecutive frames, up to the last one, in which the person was lost
 
-    @property
-    def search_frames(self) -> int:
-        """Frames between two routine limb searches; 0: none."""
-        seconds = self.contours.search_every
-        return max(int(seconds * self.fps), 1) if seconds else 0
-
-    @property
-    def opening_frames(self) -> int:
-        """Number of frames used by the initialisation."""
-        return self.contours.init_frames
-
-    @property
-    def body(self) -> ConeBody:
-        """The body, in the tracker's own world; known after :meth:`start` or :meth:`restore`."""
-        if self._body is None:
-            raise RuntimeError("the tracker has no body yet: call start() or restore() first")
-        return self._body
-
-    def take_body(self, body: ConeBody) -> None:
-        """Track this body from now on; the learned colours are kept."""
-        known = self.colors.state() if self._body is not None else {}
-        self._body = body = body.standing("z")
-        self.colors = PartColors(body)
-        self.colors.restore(known)
-        self.limbs = limbs_of(body)
-
-    def prepare(self) -> None:
-        """Compile the kernels; otherwise each is compiled when it is first called."""
-        body = build_cone_body(BodyDimensions.from_stature(1.7))
-        empty = np.zeros((len(self.views.rig), *self.views.rig.frame_shape), np.uint8)
-        seen = self.views.pyramid(empty, 1, False)
-        pose = np.zeros((1, len(body.skeleton.names)))
-        normal_equations(body.arrays, self.views.at(seen, 0), pose, self.line_search)
-        Evidence.of(self.screen, empty).costs(body, pose)
-
-    # --- initialisation (silhouette paper, section 4.6) ---------------------------------------------------------
-
-    def find(self, frames: Sequence[Observation], subject: Subject) -> Float:
-        """Return the pose (D,) in the first of the frames; the body is fitted to all of them.
-
-        Args:
-            frames: consecutive observations, at least one; a whole stride is better.
-            subject: what is known of the person. A body that is known is not fitted. Without a rough pose, walking
-                phases, standing and the Da Vinci pose are tried.
-
-        Raises:
-            CaptureError: fewer than two cameras see anybody in the first frame, or the silhouettes contradict the
-                height.
-        """
-        pyramids = [self.pyramid(frame) for frame in frames]
-        rough: Float | None = None
-        init, hull_m = subject.init, subject.hull_m
-        stature = (init and init.height_m) or subject.height_m
-        if init is None:
-            centroid(self.views.rig, pyramids[0], frames[0].index)  # raises if nobody is there, before a body is taken
-            apparent = stature_of(self, pyramids[:: 6 if stature else 1])  # a check needs fewer frames
-            if stature and not 1 / MOST_STATURE_RATIO < apparent / stature < MOST_STATURE_RATIO:
-                raise CaptureError(
-                    f"the height of {stature:.2f} m contradicts the silhouettes, which show a person of about "
-                    f"{apparent:.2f} m: correct the height in capture.toml, or omit it; if it is right, "
-                    "calibration.toml has another unit or scale"
-                )
-            # clothes enlarge the silhouettes, raised arms the hull; who bends has a low hull
-            if hull_m and apparent / hull_m < MOST_STATURE_RATIO:
-                apparent = min(apparent, hull_m)
-            average = BodyDimensions.from_stature(stature or apparent)
-        else:
-            average, given, angles = rough_pose(init.joints, init.angles, stature, self.world)
-        self.take_body(subject.body or build_cone_body(average))
-        if init is not None:
-            rough = self.settle(pyramids[0], convert_poses(angles, given, self.body.skeleton)[None]).states[0]
-        with self._opening_cameras(frames, pyramids) as seen:
-            hypotheses = find_person(self, *seen, rough)
-        if not self.contours.adapt or subject.body is not None:
-            return np.asarray(hypotheses[0].poses[0])
-        return self._adapt(frames, pyramids, hypotheses, average.stature, stature is not None)
-
-    @contextmanager
-    def _opening_cameras(
-        self, frames: Sequence[Observation], pyramids: Sequence[Pyramid]
-    ) -> Iterator[tuple[Sequence[Observation], Sequence[Pyramid]]]:
-        """Use at most :data:`OPENING_CAMERAS` inside, those from the most different sides; yield their share."""
-        rig = self.world.rig
-        # a camera that sees nobody in the first frame is no use for the search
-        seeing = np.flatnonzero((pyramids[0].masks[0] >= 128).any(axis=(1, 2)))
-        if len(seeing) <= OPENING_CAMERAS:
-            yield frames, pyramids
-            return
-        p_centroid = centroid(rig, pyramids[0], frames[0].index)
-        chosen = seeing[spread_out(rig.centers[seeing], p_centroid, OPENING_CAMERAS)]
-        some = Rig(tuple(rig[c] for c in chosen))
-        if some.frame_shape != rig.frame_shape:  # their images would have another size
-            yield frames, pyramids
-            return
-        whole = self.views, self.screen, self.choice
-        self.views, self.screen, self.choice = Views(some), RayGrid(some, SCREEN_ROWS), RayGrid(some, CHOICE_ROWS)
-        try:
-            yield [_only(frame, chosen) for frame in frames], [pyramid.of_views(chosen) for pyramid in pyramids]
-        finally:
-            self.views, self.screen, self.choice = whole
-
-    def _adapt(
-        self,
-        frames: Sequence[Observation],
-        pyramids: Sequence[Pyramid],
-        hypotheses: Sequence[TrajectoryHypothesis],
-        stature: float,
-        known: bool,
-    ) -> Float:
-        """Fit the body to the opening and return the pose (D,) in its first frame.
-
-        Of several hypotheses the one is chosen that has the lowest product of two residuals: that of the average body
-        and that of the body fitted to it, because a fitted body compensates a part of a wrong trajectory.
-
-        Args:
-            frames, pyramids: the F frames of the opening, and their silhouettes.
-            hypotheses: trajectories over these frames.
-            stature, known: stature, metres, and whether it was given rather than estimated.
-        """
-        count = min(INFORMATIVE_FRAMES, len(pyramids))
-        chosen = np.unique(np.linspace(0, len(pyramids) - 1, count).round().astype(int))
-        deviation = STATURE_DEVIATION if known else ESTIMATED_STATURE_DEVIATION
-        found: list[tuple[float, ConeBody, Float]] = []
-        for hypothesis in hypotheses:
-            body, fitted = self.fit(pyramids, hypothesis.poses, chosen, stature, deviation)
-            cost = hypothesis.cost
-            if len(hypotheses) > 1:
-                self.take_body(body)
-                residuals = np.array(list(map(self._converged_residual, frames, pyramids, hypothesis.poses)))
-                cost *= float(residuals[np.isfinite(residuals)].mean())  # infinite in frames without a person
-            found.append((cost, body, fitted[0]))
-        _, body, pose = min(found, key=lambda one: one[0])
-        self.take_body(body)
-        return np.asarray(pose)
-
-    def _converged_residual(self, frame: Observation, pyramid: Pyramid, pose: Float) -> float:
-        """Return E_S of the pose that a pose (D,) converges to; uncertain pixels count half."""
-        return float(self.mean_residual(pyramid, self.settle(pyramid, pose[None]).states, frame.uncertain)[0])
-
-    def fit(
-        self,
-        pyramids: Sequence[Pyramid],
-        poses: Float,
-        chosen: NDArray[np.int64],
-        stature: float,
-        stature_deviation: float = STATURE_DEVIATION,
-    ) -> tuple[ConeBody, Float]:
-        """Fit the body to the chosen ones of several frames; return it, and its poses in them."""
-        seen = [pyramids[i] for i in chosen]
-        return fit_body(self.views, seen, poses[chosen], self.line_search, stature, stature_deviation)
-
+    @abstractmethod
     def start(self, frames: Sequence[Observation], subject: Subject) -> None:
-        """Find the subject in the first frame, see :meth:`find`."""
-        self.find(frames, subject)
+        """Find the subject in the first frame and fit the body to all of them, see :meth:`ContourFinder.find`."""
+
+    @abstractmethod
+    def step(self, frame: Observation) -> Estimate:
+        """Return the estimate for the next frame."""
+
+    @abstractmethod
+    def last_poses(self) -> tuple[Float, Float]:
+        """Return the poses (D,) of the last frame and of the frame before."""
+
+    @abstractmethod
+    def rewind(self, state: Mapping[str, Any]) -> None:
+        """Go back to a state."""
 
     def state(self) -> Mapping[str, Any]:
         """Return what :meth:`restore` needs, beside the model, to continue after the last frame.
@@ -278,9 +74,6 @@ class ContourTracker:
         """
         return {"world": np.column_stack([self.world.rotation, self.world.origin])}
 
-    def rewind(self, state: Mapping[str, Any]) -> None:
-        """Go back to a state."""
-
     def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
         """Continue a run from its model and state."""
         self.take_body(restore_body(model))
@@ -289,10 +82,6 @@ class ContourTracker:
     def lose(self) -> None:
         """Take the last frame for lost: the person is searched for in the next one."""
         self._lost_for = max(self._lost_for, 1)
-
-    def last_poses(self) -> tuple[Float, Float]:
-        """Return the poses (D,) of the last frame and of the frame before, in the tracker's frame."""
-        raise NotImplementedError
 
     def rendered(self, ahead: bool) -> RenderedBody:
         """Return the body on the grid :attr:`choice`: at the last pose, or at the one expected in the next frame."""
@@ -331,100 +120,9 @@ class ContourTracker:
         residual = self.mean_residual(pyramid, self.settle(pyramid, pose[None]).states, frame.uncertain)[0]
         return by_color - float(np.log(1 / WRONG - 1) * min(residual, 1.0))
 
-    # --- one frame ----------------------------------------------------------------------------------------------
-
-    def pyramid(self, frame: Observation) -> Pyramid:
-        """Return the frame's silhouettes, cleaned, at all scales."""
-        return self.views.pyramid(frame.masks, self.solver.scales, True)
-
     def cleaned(self, masks: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return masks (V, H, W) after cleaning."""
         return self.views.pyramid(masks, 1, True).masks[0]
-
-    def settle(
-        self,
-        pyramid: Pyramid,
-        poses: Float,
-        levels: Sequence[int] | None = None,
-        images: NDArray[np.uint8] | None = None,
-        prior: Prior | None = None,
-        limb: Limb | None = None,
-        solver: GaussNewtonSettings | None = None,
-    ) -> BatchSolution:
-        """Minimise by Gauss-Newton from poses (B, D), all in one frame or each in its own.
-
-        Args:
-            pyramid: silhouettes of one frame, or of B.
-            poses: (B, D).
-            levels: scales, 0 the finest; None: all.
-            images: with images, colour differences attract contours inside the silhouette, too.
-            prior: see :class:`~tk.optim.gauss_newton.Prior`.
-            limb: only this limb moves.
-            solver: iterations at each scale; None: the tracker's own.
-        """
-        body = self.body
-        arrays, free = (limb.arrays, limb.dofs) if limb else (body.arrays, None)
-        regions = None if images is None else self.colors.regions(images)
-        return gauss_newton.minimise(
-            lambda states, scale, steps: descend(
-                arrays, self.views.at(pyramid, scale), states, self.line_search, steps, regions
-            ),
-            poses,
-            free,
-            body.skeleton.lower,
-            body.skeleton.upper,
-            solver or self.solver,
-            prior,
-            levels,
-        )
-
-    def evidence(self, grid: RayGrid, frame: Observation, pyramid: Pyramid) -> Evidence:
-        """Return the costs of a frame on a grid of rays."""
-        return Evidence.of(grid, pyramid.masks[0], frame.uncertain, frame.images, self.colors)
-
-    def mean_residual(self, pyramid: Pyramid, poses: Float, uncertain: NDArray[np.bool_] | None = None) -> Float:
-        """Return (B,) E_S, mean over the views that see anybody, inf if none does. A body on ``uncertain`` pixels
-        counts half."""
-        evidence = Evidence.of(self.screen, pyramid.masks[0], uncertain)
-        return evidence.costs(self.body, poses)
-
-    def search(
-        self,
-        frame: Observation,
-        pyramid: Pyramid,
-        evidence: Evidence,
-        pose: Float,
-        images: NDArray[np.uint8] | None = None,
-        misplaced: Sequence[Limb] = (),
-    ) -> tuple[Float, Float]:
-        """Search for better poses of the limbs, see :mod:`tk.trackers.limb_search`, and settle the best of them.
-
-        Args:
-            frame, pyramid, evidence: the frame, its silhouettes, its costs on the grid :attr:`screen`.
-            pose: (D,) current pose.
-            images: as in :meth:`settle`.
-            misplaced: limbs that are known to be misplaced.
-
-        Returns:
-            Poses (B, D), the current one first, and their costs (B,).
-        """
-
-        def settle(poses: Float, levels: Sequence[int], limb: Limb | None) -> Float:
-            return self.settle(pyramid, poses, levels, images, limb=limb).states
-
-        search = LimbSearch(self.body, self.limbs, evidence, settle, pose)
-        rng = np.random.default_rng([7, frame.index])
-        best = search.better(min(1, self.solver.scales - 1), misplaced, rng)
-        if not len(best):
-            return pose[None], np.array([search.own])
-        settled = np.concatenate([pose[None], settle(best, (0,), None)])
-        return settled, self.evidence(self.choice, frame, pyramid).costs(self.body, settled)
-
-    def improved(self, frame: Observation, pyramid: Pyramid, pose: Float) -> Float:
-        """Return the pose (D,), or the best one of a limb search if that costs :data:`GAIN` less."""
-        poses, cost = self.search(frame, pyramid, self.evidence(self.screen, frame, pyramid), pose)
-        best = int(np.argmin(cost))
-        return np.asarray(poses[best if cost[best] < cost[0] - GAIN else 0])
 
     def recover(self, pyramid: Pyramid, pose: Float, residual: float) -> tuple[Float, float]:
         """Search for a lost person as at the start; return the pose with the lowest residual (E_S), and that residual.
@@ -460,15 +158,3 @@ class ContourTracker:
         """Return the fields of an :class:`~tk.trackers.protocol.Estimate` that follow from a pose (D,)."""
         skeleton, world = self.body.skeleton, self.world
         return {"pose": world.poses_out(pose), "joints": world.points_out(skeleton.joints(pose))}
-
-    def model(self) -> Mapping[str, Any]:
-        """Return the body as stored in `/model`."""
-        return body_values(self.body)
-
-
-def _only(frame: Observation, views: NDArray[np.intp]) -> Observation:
-    """Return a frame of some views, without images, which the search at the start does not use."""
-    uncertain = None if frame.uncertain is None else frame.uncertain[views]
-    sources = None if frame.sources is None else frame.sources[views]
-    images = np.empty((len(views), 0, 0, 3), np.uint8)
-    return replace(frame, images=images, masks=frame.masks[views], uncertain=uncertain, sources=sources)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.model.body.skeleton import Skeleton
-from tk.trackers.contour_tracker import GAIN
+from tk.trackers.contour_finder import GAIN
 
 Float = NDArray[np.float64]
 

@@ -29,15 +29,15 @@ from tk.model.setup import AVERAGE_STATURE_M
 from tk.trackers.protocol import Observation
 
 if TYPE_CHECKING:
-    from tk.trackers.contour_tracker import ContourTracker
+    from tk.trackers.contour_finder import ContourFinder
 
 Float = NDArray[np.float64]
 
 # Headings, and walking phases of each, from which the person is searched for.
 HEADINGS, PHASES = 8, 8
-# Poses that differ by more than this, mean over the joints, metres, are different hypotheses. Coarser than the
-# tracker's own SAME_POSE_M, because the body is an average one that is not fitted yet. Half and twice the
-# value change no mean error of dance and cube (50 frames).
+# Poses that differ by more than this, mean over the joints, metres, are different hypotheses. Coarser than the limb
+# search's SAME_POSE_M, because the body is an average one that is not fitted yet. Half and twice the value change no
+# mean error of dance and cube (50 frames).
 SAME_START_M = 0.15
 # Of the poses that the coarsest scale gives for each way of facing, one in REFINED goes on to the finer ones. Of 13
 # starts of dance and cube, all have the same pose with 2 as without this; with 3, one has a better pose; with 4, one
@@ -90,13 +90,13 @@ class TrajectoryHypothesis(NamedTuple):
 
 
 def find_person(
-    tracker: ContourTracker, frames: Sequence[Observation], pyramids: Sequence[Pyramid], pose: Float | None = None
+    finder: ContourFinder, frames: Sequence[Observation], pyramids: Sequence[Pyramid], pose: Float | None = None
 ) -> list[TrajectoryHypothesis]:
     """Return trajectory hypotheses over F consecutive frames, best first. Those after the first are within AMBIGUOUS of
-    it; the caller fits a body to each of them to decide. The tracker already has an average body.
+    it; the caller fits a body to each of them to decide.
 
     Args:
-        tracker: see :class:`ContourTracker`.
+        finder: with an average body.
         frames: F observations, at least one.
         pyramids: their silhouettes.
         pose: (D,) pose in the first frame, if known; there is one hypothesis then.
@@ -105,15 +105,15 @@ def find_person(
         CaptureError: fewer than two cameras see anybody in the first frame, or no pose explains what they see.
     """
     if pose is not None:
-        return _follow(tracker, frames, pyramids, [_searched(tracker, frames[0], pyramids[0], pose)], 0)
-    skeleton = tracker.body.skeleton
+        return _follow(finder, frames, pyramids, [_searched(finder, frames[0], pyramids[0], pose)], 0)
+    skeleton = finder.body.skeleton
     hypotheses: list[TrajectoryHypothesis] = []
     alternatives: list[tuple[int, int, Float, float]] = []  # rank in its anchor, anchor, pose, handicap
     clear: list[tuple[int, Float, float]] = []  # anchor, pose, handicap
     least = np.inf
     for anchor in np.unique(np.linspace(0, len(frames) - 1, ANCHORS).astype(int)):
         try:
-            residual, poses = _find(tracker, frames[anchor], pyramids[anchor])
+            residual, poses = _find(finder, frames[anchor], pyramids[anchor])
         except CaptureError:
             if anchor == 0:
                 raise
@@ -129,7 +129,7 @@ def find_person(
         if residual < CLEAR and not hypotheses:
             clear = [(int(anchor), poses[0], 1.0)]  # followed with its alternatives: no other anchor is needed
             break
-        hypotheses += _follow(tracker, frames, pyramids, poses[:1], anchor)
+        hypotheses += _follow(finder, frames, pyramids, poses[:1], anchor)
         if residual < CLEAR:
             break
     if not hypotheses and not clear:
@@ -140,7 +140,7 @@ def find_person(
     likeliest = sorted(range(len(alternatives)), key=lambda i: alternatives[i][0])[:FOLLOWED]
     for anchor, group in groupby([*clear, *(alternatives[i][1:] for i in sorted(likeliest))], itemgetter(0)):
         new = [(pose, handicap) for _, pose, handicap in group if not _contains(skeleton, hypotheses, anchor, pose)]
-        followed = _follow(tracker, frames, pyramids, [pose for pose, _ in new], anchor)
+        followed = _follow(finder, frames, pyramids, [pose for pose, _ in new], anchor)
         hypotheses += [one._replace(handicap=handicap) for one, (_, handicap) in zip(followed, new, strict=True)]
     hypotheses.sort(key=lambda hypothesis: hypothesis.cost)
     least = min(hypothesis.residual for hypothesis in hypotheses)
@@ -159,25 +159,25 @@ def _contains(skeleton: Skeleton, hypotheses: Sequence[TrajectoryHypothesis], fr
     return any(skeleton.apart(hypothesis.poses[frame], joints) < SAME_START_M for hypothesis in hypotheses)
 
 
-def _find(tracker: ContourTracker, frame: Observation, pyramid: Pyramid) -> tuple[float, list[Float]]:
+def _find(finder: ContourFinder, frame: Observation, pyramid: Pyramid) -> tuple[float, list[Float]]:
     """Return the lowest residual (E_S) in a frame, and poses (D,): the one that has it, then one that faces the other
     way and those that few cameras cannot distinguish from it."""
-    skeleton = tracker.body.skeleton
-    p_centroid = centroid(tracker.views.rig, pyramid, frame.index)
-    levels = range(tracker.solver.scales - 1, -1, -1)
+    skeleton = finder.body.skeleton
+    p_centroid = centroid(finder.views.rig, pyramid, frame.index)
+    levels = range(finder.solver.scales - 1, -1, -1)
 
     def ordered(poses: Float, levels: Sequence[int]) -> tuple[Float, NDArray[np.bool_]]:
         """Return the poses that these converge to, best first, and whether they face another way than the best."""
-        settled = tracker.settle(pyramid, poses, levels).states
-        order = settled[np.argsort(tracker.mean_residual(pyramid, settled, frame.uncertain), kind="stable")]
+        settled = finder.settle(pyramid, poses, levels).states
+        order = settled[np.argsort(finder.mean_residual(pyramid, settled, frame.uncertain), kind="stable")]
         return order, _turned(skeleton, order, order[0])
 
     coarse, turned = ordered(gait.hypotheses(skeleton, HEADINGS, PHASES, p_centroid), levels[:1])
     kept = [poses[: -(-len(poses) // REFINED)] for poses in (coarse[~turned], coarse[turned])]
     order, turned = ordered(np.concatenate(kept), levels[1:])
     finalists = np.array(_distinct(skeleton, order, FINALISTS) + _distinct(skeleton, order[turned], OPPOSITE))
-    poses = np.array([_searched(tracker, frame, pyramid, pose) for pose in np.unique(finalists, axis=0)])
-    residual = tracker.mean_residual(pyramid, poses, frame.uncertain)
+    poses = np.array([_searched(finder, frame, pyramid, pose) for pose in np.unique(finalists, axis=0)])
+    residual = finder.mean_residual(pyramid, poses, frame.uncertain)
     best = int(np.argmin(residual))
     others = np.flatnonzero(_turned(skeleton, poses, poses[best]) & (residual < NEARLY * residual[best]))
     opposite = others[np.argsort(residual[others], kind="stable")[:1]]
@@ -188,7 +188,7 @@ def _find(tracker: ContourTracker, frame: Observation, pyramid: Pyramid) -> tupl
 
 
 def _follow(
-    tracker: ContourTracker,
+    finder: ContourFinder,
     frames: Sequence[Observation],
     pyramids: Sequence[Pyramid],
     starts: Sequence[Float],
@@ -202,15 +202,15 @@ def _follow(
     residuals = np.full((len(starts), F), np.nan)
 
     def residual_of(i: int, poses: Float) -> Float:
-        return tracker.mean_residual(pyramids[i], poses, frames[i].uncertain)
+        return finder.mean_residual(pyramids[i], poses, frames[i].uncertain)
 
     residuals[:, anchor] = residual_of(anchor, poses[:, anchor])
-    every = tracker.search_frames
+    every = finder.search_frames
     for step, end in ((1, F), (-1, -1)):
         for i in range(anchor + step, end, step):
             last = poses[:, i - step]
             before = poses[:, i - 2 * step] if abs(i - anchor) > 1 else poses[:, anchor]
-            now = tracker.settle(pyramids[i], last + tracker.contours.prediction * (last - before)).states
+            now = finder.settle(pyramids[i], last + finder.contours.prediction * (last - before)).states
             residual = residual_of(i, now)
             if not np.isfinite(residual).any():  # no camera sees anybody
                 poses[:, i] = last
@@ -219,17 +219,17 @@ def _follow(
             means = np.nanmean(residuals, axis=1)  # no search brings back a trajectory that is worse by far
             searched = (high | (abs(i - anchor) % every == 0)) & (means <= AMBIGUOUS * means.min()) if every else []
             for b in np.flatnonzero(searched):
-                now[b] = tracker.improved(frames[i], pyramids[i], now[b])
+                now[b] = finder.improved(frames[i], pyramids[i], now[b])
                 residual[b] = residual_of(i, now[b : b + 1])[0]
             poses[:, i], residuals[:, i] = now, residual
     means = np.nanmean(residuals, axis=1)
     return [TrajectoryHypothesis(one, float(mean)) for one, mean in zip(poses, means, strict=True)]
 
 
-def _searched(tracker: ContourTracker, frame: Observation, pyramid: Pyramid, pose: Float) -> Float:
+def _searched(finder: ContourFinder, frame: Observation, pyramid: Pyramid, pose: Float) -> Float:
     """Return the pose (D,) after limb searches, repeated as long as a search finds a better pose."""
     for _ in range(_SEARCHES):
-        found = tracker.improved(frame, pyramid, pose)
+        found = finder.improved(frame, pyramid, pose)
         if np.array_equal(found, pose):
             break
         pose = found
@@ -280,7 +280,7 @@ def centroid(rig: Rig, pyramid: Pyramid, index: int) -> Float:
     return np.asarray(np.linalg.solve(A, y), np.float64)
 
 
-def stature_of(tracker: ContourTracker, pyramids: Sequence[Pyramid]) -> float:
+def stature_of(finder: ContourFinder, pyramids: Sequence[Pyramid]) -> float:
     """Return the stature, metres, at which an average body covers as many pixels as the silhouettes do.
 
     The area hardly changes when a person bends or raises the arms; the silhouette's height does. Girth and clothes
@@ -290,11 +290,11 @@ def stature_of(tracker: ContourTracker, pyramids: Sequence[Pyramid]) -> float:
     ratios: list[Float] = []
     for pyramid in pyramids:
         try:
-            p_centroid = centroid(tracker.views.rig, pyramid, 0)
+            p_centroid = centroid(finder.views.rig, pyramid, 0)
         except CaptureError:
             continue
         poses = gait.hypotheses(body.skeleton, 4, 0, p_centroid)  # standing, and the Da Vinci pose
-        evidence = Evidence.of(tracker.screen, pyramid.masks[0])
+        evidence = Evidence.of(finder.screen, pyramid.masks[0])
         _, met = evidence.cast(body, poses)
         drawn = met.label > 0 if evidence.others is None else (met.label > 0) & ~evidence.others
         covered = np.count_nonzero(drawn, axis=(2, 3)).mean(axis=0)

@@ -39,7 +39,8 @@ from tk.model.masks.silhouettes import Pyramid
 from tk.model.setup import Setup, Subject
 from tk.optim.gauss_newton import GaussNewtonSettings, Prior
 from tk.settings import RegionSettings, Settings, SilhouetteSettings
-from tk.trackers.contour_tracker import GAIN, RECOVER_EVERY, ContourTracker
+from tk.trackers.contour_finder import GAIN
+from tk.trackers.contour_tracker import RECOVER_EVERY, ContourTracker
 from tk.trackers.hypotheses import MARGIN, PATIENCE, RENEWAL, Hypothesis, disagreement
 from tk.trackers.limb_search import SAME_POSE_M
 from tk.trackers.protocol import Estimate, Observation, Stopwatch
@@ -134,7 +135,6 @@ class RegionTracker(ContourTracker):
         self._lost_for = self._high_for = 0
 
     def start(self, frames: Sequence[Observation], subject: Subject) -> None:
-        """Find the subject in the first frame and fit the body to all of them, see :meth:`ContourTracker.find`."""
         pose = self.find(frames, subject)
         self._alive = [Hypothesis(pose, pose, 0.0)]
         self._mean_posture, self._postures = np.zeros((len(JOINTS), 3)), 0
@@ -149,7 +149,6 @@ class RegionTracker(ContourTracker):
         self._reset()
 
     def step(self, frame: Observation) -> Estimate:
-        """Return the estimate for the next frame."""
         watch = Stopwatch()
         contours, config = self.contours, self.config
         frame = self.without_foreign(frame)
@@ -251,7 +250,6 @@ class RegionTracker(ContourTracker):
         return self._alive[0]
 
     def last_poses(self) -> tuple[Float, Float]:
-        """Return the poses (D,) of the last frame and of the frame before, in the tracker's frame."""
         return self._best.pose, self._best.previous
 
     def _iterations(self) -> tuple[list[int], GaussNewtonSettings]:
@@ -447,7 +445,6 @@ class RegionTracker(ContourTracker):
         )
 
     def state(self) -> Mapping[str, Any]:
-        """Return what :meth:`restore` needs, beside the model, to continue after the last frame."""
         return {
             **super().state(),
             "poses": np.array([h.pose for h in self._alive]),
@@ -465,7 +462,6 @@ class RegionTracker(ContourTracker):
         }
 
     def rewind(self, state: Mapping[str, Any]) -> None:
-        """Go back to a state."""
         rows = zip(*(np.array(state[name]) for name in ("poses", "previous", "costs", "ages", "jumped")), strict=True)
         self._alive = [Hypothesis(p, q, float(c), int(a), bool(j)) for p, q, c, a, j in rows]
         self.residuals.restore(state)

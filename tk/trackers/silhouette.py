@@ -4,7 +4,7 @@ It uses neither voxels nor colours, so two or three cameras and their masks are 
 
     masks → cleaned, scales → {contours → edgels along their normals → normal equations → step} × iterations × scales
 
-Beyond the paper, a limb search runs at intervals (:meth:`ContourTracker.search`): a silhouette hides an arm in front of
+Beyond the paper, a limb search runs at intervals (:meth:`ContourFinder.search`): a silhouette hides an arm in front of
 or behind the trunk, and when the arm reappears, no contour may be near it.
 """
 
@@ -22,7 +22,8 @@ from tk.model.cameras.camera import Rig
 from tk.model.setup import Setup, Subject
 from tk.optim.gauss_newton import GaussNewtonSettings
 from tk.settings import Settings, SilhouetteSettings
-from tk.trackers.contour_tracker import LINE_SEARCH, RECOVER_EVERY, SOLVER, ContourTracker
+from tk.trackers.contour_finder import LINE_SEARCH, SOLVER
+from tk.trackers.contour_tracker import RECOVER_EVERY, ContourTracker
 from tk.trackers.protocol import Estimate, Observation, Stopwatch
 
 Float = NDArray[np.float64]
@@ -55,13 +56,11 @@ class SilhouetteTracker(ContourTracker):
         self._fresh = True
 
     def start(self, frames: Sequence[Observation], subject: Subject) -> None:
-        """Find the subject in the first frame and fit the body to all of them, see :meth:`ContourTracker.find`."""
         self._pose = self._previous = self.find([_blind(f) for f in frames], subject)
         self._lost_for = 0
         self._fresh = True
 
     def step(self, frame: Observation) -> Estimate:
-        """Return the estimate for the next frame."""
         watch = Stopwatch()
         config = self.contours
         pyramid = self.pyramid(frame)
@@ -95,15 +94,12 @@ class SilhouetteTracker(ContourTracker):
         )
 
     def last_poses(self) -> tuple[Float, Float]:
-        """Return the poses (D,) of the last frame and of the frame before, in the tracker's frame."""
         return self._pose, self._previous
 
     def state(self) -> Mapping[str, Any]:
-        """Return what :meth:`restore` needs, beside the model, to continue after the last frame."""
         return {**super().state(), "pose": self._pose, "previous": self._previous, "lost_for": self._lost_for}
 
     def rewind(self, state: Mapping[str, Any]) -> None:
-        """Go back to a state."""
         self._pose, self._previous = (np.array(state[name]) for name in ("pose", "previous"))
         self._lost_for = int(state["lost_for"])
         self._fresh = False

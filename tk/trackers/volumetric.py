@@ -38,7 +38,7 @@ from tk.model.setup import Setup, Subject
 from tk.optim import schedule
 from tk.optim.smd import MAX_ITERATIONS
 from tk.settings import Settings
-from tk.trackers.contour_tracker import ContourTracker
+from tk.trackers.contour_finder import ContourFinder
 from tk.trackers.protocol import Estimate, Observation, Stopwatch
 
 Float = NDArray[np.float64]
@@ -99,7 +99,7 @@ class VolumetricTracker:
         self.up = up
         self.rig = rig
         self.hull = VisualHull(rig, VoxelGrid.cover(volume, config.voxels))
-        self._finder = ContourTracker(rig, up, config.silhouette, fps)
+        self._finder = ContourFinder(rig, up, config.silhouette, fps)
         skeleton = build_skeleton(BodyDimensions.from_stature(1.7), up, paper=True)
         self.pose_names, self.pose_units = skeleton.names, skeleton.units
         self.skin: SuperellipsoidBody
@@ -116,7 +116,7 @@ class VolumetricTracker:
         self._finder.prepare()
 
     def start(self, frames: Sequence[Observation], subject: Subject) -> None:
-        """Find the subject in the first frame and fit the body to all frames, see :meth:`ContourTracker.find`.
+        """Find the subject in the first frame and fit the body to all frames, see :meth:`ContourFinder.find`.
 
         Raises:
             CaptureError: the volume is empty.
