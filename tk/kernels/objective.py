@@ -69,7 +69,6 @@ def _objective_kernel(real):
         starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
         settings: ti.types.ndarray(dtype=real, ndim=1),  # (13,)
         spread: ti.i32,
-        hold: ti.i32,
         M: ti.i32,
         Q: ti.i32,
         E: ti.i32,
@@ -77,8 +76,8 @@ def _objective_kernel(real):
         entries: ti.types.ndarray(dtype=real, ndim=3),  # (B, E, 16) of the alignment term
         state: ti.types.ndarray(dtype=real, ndim=2),  # (2 B, D) poses, then directions
         scratch: ti.types.ndarray(dtype=real, ndim=3),  # (T, D + P, 39)
-        assigned: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, M) out, in when hold = 1
-        covering: ti.types.ndarray(dtype=real, ndim=3),  # (B, Q, 4) piece and projection, out, in when hold = 1
+        assigned: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, M) out
+        covering: ti.types.ndarray(dtype=real, ndim=3),  # (B, Q, 4) piece and projection, out
         sums: ti.types.ndarray(dtype=real, ndim=2),  # (T, 1 + 2 D) out
     ):
         for turn in range(spread * sums.shape[0]):
@@ -91,16 +90,13 @@ def _objective_kernel(real):
             sums[c, 0] = 0.0
             forward_tree(tree, state, b, c, scratch)
             start_wrenches(tree, state, state.shape[0] // 2 + b, c, scratch)
-            if hold == 0:
-                place_pieces(scratch, c, D, pieces)
+            place_pieces(scratch, c, D, pieces)
             for e in range(E * part // tasks, E * (part + 1) // tasks):
                 add_alignment(scratch, cameras, entries, sums, b, c, e)
             for m in range((M + Q) * part // tasks, (M + Q) * (part + 1) // tasks):
-                if hold == 0:
-                    assign(
-                        samples, pieces, voxels, fits, starts, settings, chosen, scratch, b, c, D, m, M,
-                        assigned, covering,
-                    )  # fmt: skip
+                assign(
+                    samples, pieces, voxels, fits, starts, settings, chosen, scratch, b, c, D, m, M, assigned, covering,
+                )  # fmt: skip
                 v, k, x0, nu, scale = load_pair(samples, pieces, settings, chosen, assigned, covering, b, m, M)
                 if v < 0:
                     sums[c, 0] = sums[c, 0] + scale
@@ -280,7 +276,6 @@ class ObjectiveKernel:
         pose: np.ndarray,
         direction: np.ndarray | None,
         settings: ObjectiveParameters,
-        held: Held | None = None,
         entries: np.ndarray | None = None,
     ) -> Evaluation:
         """Return value, gradient and Hessian-vector product at B poses.
@@ -292,7 +287,6 @@ class ObjectiveKernel:
             pose: (B, D).
             direction: (B, D) the v of H·v; None for zeros.
             settings: constants.
-            held: assignments to use instead of a new search.
             entries: (B, E, 16) of the alignment term (:mod:`tk.kernels.alignment`), if it counts.
         """
         E = 0 if entries is None else entries.shape[1]
@@ -304,17 +298,13 @@ class ObjectiveKernel:
         state[:B] = pose
         if direction is not None:
             state[B:] = direction
-        if held is None:
-            found = Held(np.empty((B, M), np.int32), np.empty((B, max(Q, 1), 4), self.dtype))
-        else:
-            found = Held(np.array(held.assigned, np.int32), np.array(held.covering, self.dtype))
+        found = Held(np.empty((B, M), np.int32), np.empty((B, max(Q, 1), 4), self.dtype))
         self._kernel(
             index.positions,
             index.fits,
             index.starts,
             self._packed(settings, M, Q, index),
             spread_of(len(sums)),
-            int(held is not None),
             M,
             Q,
             E,
