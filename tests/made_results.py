@@ -37,7 +37,7 @@ def write_motion(
     known = {"pose_names": skeleton.names, "pose_units": skeleton.units, "stages": ("all",)}
     whole = ResultMeta(**{"timing_stages": ("total",), **usual, **known, **meta})
     people = range(2 if second else 1)
-    with ResultWriter.create(path, whole, people=len(people)) as writer:
+    with ResultWriter.create(path, whole) as writer:
         for person in people:
             writer.write_model(model, person)
         for f, pose in enumerate(poses):

@@ -148,11 +148,11 @@ def locked(folder: Path, busy: TkError) -> Iterator[None]:
         os.close(handle)
 
 
-def resolved(path: Path, error: type[TkError] = ConfigError) -> Path:
+def resolved(path: Path) -> Path:
     """Return the absolute path without links.
 
     Raises:
-        TkError: ``error``: the links form a loop, or no file can have this name.
+        ConfigError: the links form a loop, or no file can have this name.
     """
     try:
         real = path.resolve()
@@ -161,7 +161,7 @@ def resolved(path: Path, error: type[TkError] = ConfigError) -> Path:
         return real
     except (RuntimeError, OSError, ValueError) as reason:
         cause = (isinstance(reason, OSError) and reason.strerror) or " ".join(str(reason).split())
-        raise error(f"{path}: cannot be written: {cause}; choose another name") from None
+        raise ConfigError(f"{path}: cannot be written: {cause}; choose another name") from None
     return real
 
 

@@ -336,10 +336,9 @@ def cast(
     cost: NDArray[np.float32],
     poses: NDArray[np.floating],
     drawn: NDArray[np.int32] | None = None,
-    before: Cast | None = None,
 ) -> tuple[NDArray[np.float64], Cast]:
     """Return the sums of the rays' costs, and the casts; arguments as for :func:`costs`."""
-    before = before or nothing(cost.shape[:3])
+    before = nothing(cost.shape[:3])
     B = len(poses)
     met = Cast(np.repeat(before.label[None], B, axis=0), np.repeat(before.depth[None], B, axis=0))
     return _launch(body, rays, cost, poses, drawn, before, np.inf, met), met

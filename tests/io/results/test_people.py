@@ -29,7 +29,7 @@ def people_at(index: int) -> dict[int, dict[str, Any]]:
 
 
 def write_two(path: Path, count: int, with_state: int | None = None) -> None:
-    with ResultWriter.create(path, META, people=2) as writer:
+    with ResultWriter.create(path, META) as writer:
         writer.write_model({"height_m": 1.7})
         writer.write_model({"height_m": 1.9}, person=1)
         for index in range(count):

@@ -58,13 +58,12 @@ class ResultWriter:
         self._failure: ResultError | None = None
 
     @classmethod
-    def create(cls, path: str | os.PathLike[str], meta: ResultMeta, people: int = 1) -> ResultWriter:
+    def create(cls, path: str | os.PathLike[str], meta: ResultMeta) -> ResultWriter:
         """Start a result; an existing result of that name is replaced when the first frame is written.
 
         Args:
             path: the file.
-            meta: the metadata, the same for every person.
-            people: number of people. Others can be added by :meth:`append`.
+            meta: the metadata, the same for every person; people are added by :meth:`append`.
 
         Raises:
             ResultError: the file cannot be written, another run is writing it, or a file of that name exists and is
@@ -72,7 +71,7 @@ class ResultWriter:
         """
         target = check_output(Path(path), RESULT, force=True, error=ResultError)
         with writing(target):
-            writer = cls(target, meta, Hdf5Writer(target), [{} for _ in range(people)])
+            writer = cls(target, meta, Hdf5Writer(target), [{}])
             writer._layout.put_root_attributes()
         return writer
 
