@@ -29,6 +29,7 @@ from tk.model.masks.image_health import ImageHealth, Sampled, contradiction, sam
 from tk.model.masks.mask_agreement import INCONSISTENT, Agreement, MaskAgreement
 from tk.model.masks.regions import clean_by_area
 from tk.model.masks.silhouettes import HOLE_SHARE
+from tk.run.refinement import LARGEST_DELAY
 from tk.run.segmentation import make_labeller
 from tk.run.task import Task
 from tk.settings import Settings
@@ -39,9 +40,8 @@ Masks = NDArray[np.uint8]
 # These values decide which findings are printed, and no tracking result depends on them. With half and twice each value
 # the findings on walk, fold, rig9, pair and treadmill-slow are the same, except for specks in the ragged masks of
 # treadmill-slow (half the value names two cameras more, twice the value one fewer).
-#: frames that are compared; frames whose neighbours are also compared, and number of neighbours before and after: the
-#: largest delay that is found
-_FRAMES, _DELAY_FRAMES, _LARGEST_DELAY = 10, 5, 5
+#: frames that are compared; frames whose neighbours, LARGEST_DELAY before and after, are also compared
+_FRAMES, _DELAY_FRAMES = 10, 5
 #: frames from the start of the capture that are read: videos are decoded in order, so later frames take longer
 _SPAN = 600
 #: a video is delayed if shifting it reduces the share of its masks outside the hull to less than this share of itself,
@@ -178,9 +178,9 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
     """
     span = min(capture.frame_count, _SPAN)
     frames = np.unique(np.linspace(0, span - 1, _FRAMES).round().astype(int))
-    last = max(span - 1 - _LARGEST_DELAY, span // 4)
+    last = max(span - 1 - LARGEST_DELAY, span // 4)
     centers = np.unique(np.linspace(span // 4, last, _DELAY_FRAMES).round().astype(int)).tolist()
-    near = {i + s for i in centers for s in range(-_LARGEST_DELAY, _LARGEST_DELAY + 1)} & set(range(span))
+    near = {i + s for i in centers for s in range(-LARGEST_DELAY, LARGEST_DELAY + 1)} & set(range(span))
     kept = frames[np.linspace(0, len(frames) - 1, min(pictures, len(frames))).round().astype(int)]
     notes: list[str] = list(capture.warnings)
     label = make_labeller(Task.of(capture, config), notes.append)
@@ -204,14 +204,14 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
             sick += [reason is not None for reason in health.look(frame.images, masks[frame.index])]
             if frame.index in kept:
                 images[frame.index] = frame.images.copy()
-    pairs = [(i + s, i + s + _LARGEST_DELAY) for i in centers for s in (-_LARGEST_DELAY, 0)]
+    pairs = [(i + s, i + s + LARGEST_DELAY) for i in centers for s in (-LARGEST_DELAY, 0)]
     given = [(small[i], small[k]) for i, k in pairs if capture.has_masks and i in small and k in small]
     unrelated = contradiction(given)
     compare = MaskAgreement(capture.rig, capture.volume)
     people, entered = watch.people(), watch.entered or 0
     if (later := frames >= entered).any():  # before it the masks show nobody, or people outside the volume
         kept, frames = kept[kept >= entered], frames[later]
-        centers = [i for i in centers if i - _LARGEST_DELAY >= entered] or centers
+        centers = [i for i in centers if i - LARGEST_DELAY >= entered] or centers
     agreement = compare.compare([masks[int(i)] for i in frames])
     if len(people) > 1:
         own = {index: watch.of_first(index, m) for index, m in masks.items()}
@@ -266,7 +266,7 @@ def _delays(
     C = len(compare.rig)
     small = {index: compare.small(m) for index, m in masks.items()}
     hulls = compare.hulls([compare.possible(masks[i]) for i in centers])
-    shifts = np.arange(-_LARGEST_DELAY, _LARGEST_DELAY + 1)
+    shifts = np.arange(-LARGEST_DELAY, LARGEST_DELAY + 1)
     late = np.zeros(C, np.int64)
     found = [
         best_shift(*_areas_by_shift(small, centers, hulls, [k for k in agreement.right if k != c], c, shifts))

@@ -17,7 +17,7 @@ from tk.kernels.runtime import ti
 COLOR_BINS = 4096
 # Maximum log likelihood ratio of one pixel (a factor of 20): colour models are not more certain. With 2.1 the mean
 # errors of dance and cube (50 frames) are 0.07 cm higher.
-_MOST_LOG_RATIO = 3.0
+MOST_LOG_RATIO = 3.0
 # Neighbouring pixels of a line are correlated (texture, blur, coding): this many count as one. Chosen; sensitivity not
 # measured. At 1 the border's certainty is overestimated.
 _ALIKE_PIXELS = 3.0
@@ -160,7 +160,7 @@ def search_colors(
         if i >= 0 and j >= 0 and i < width and j < height:
             bin = color_bin(image, v, j, i)
             ratio = likelihood[front, bin] - likelihood[back, bin]
-            log_sum += ti.min(ti.max(ratio, -_MOST_LOG_RATIO), _MOST_LOG_RATIO) / _ALIKE_PIXELS
+            log_sum += ti.min(ti.max(ratio, -MOST_LOG_RATIO), MOST_LOG_RATIO) / _ALIKE_PIXELS
         p = ti.exp(log_sum)
         d = k + 0.5
         total += p

@@ -24,8 +24,9 @@ from tk.model.body.plausibility import EXTENT, STATURE_M
 from tk.model.body.skeleton import up_rotation
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume, VoxelGrid
-from tk.model.hull.coarse import Voxels, dilated
+from tk.model.hull.coarse import LEAST_LITRES, Voxels, dilated
 from tk.model.hull.voxel_table import VoxelTable, components
+from tk.model.masks.sightings import BEYOND_M
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -34,11 +35,9 @@ Bool = NDArray[np.bool_]
 _VOXEL_M = 0.06
 # Rows of the images that are used, approximately: a voxel has then about two pixels at 4 m.
 _ROWS = 240
-# How far outside the working volume people are searched for, metres, where two cameras see: operators stand there.
-_BEYOND_M = 2.0
-# Volume of a person's hull, litres: a child of six weighs 20 kg (WHO growth reference), and a part of it may be hidden;
-# a man of 125 kg, whose hull may be twice as large. Smaller components than a head (4 litres) are ignored.
-_LITRES, _SPECK_LITRES = (10.0, 250.0), 4.0
+# Volume of a person's hull, litres, at most: of a man of 125 kg, whose hull may be twice as large. Components smaller
+# than a head (4 litres) are ignored.
+_MOST_LITRES, _SPECK_LITRES = 250.0, 4.0
 # A column of the floor plan is part of a trunk if so many metres of it are in the hull: an arm has 0.1 m, the trunk of
 # a crouching adult 0.6 m.
 _TRUNK_M = 0.5
@@ -349,7 +348,7 @@ class PeopleFinder:
         """Return whether voxels have a person's volume and extent, lying or standing."""
         extent = float(np.ptp(self._voxels.centers[part] @ self._to_plan.T, axis=0).max()) + self._grid.voxel_m
         litres = len(part) * self._litres
-        return litres >= _LITRES[0] and EXTENT[0] * STATURE_M[0] <= extent <= EXTENT[1] * STATURE_M[1]
+        return litres >= LEAST_LITRES and EXTENT[0] * STATURE_M[0] <= extent <= EXTENT[1] * STATURE_M[1]
 
     def _plan(self, part: NDArray[np.int64]) -> tuple[Float, NDArray[np.int64], Float]:
         """Return the floor plan of voxels: metres of hull by cell, the cell (M, 2) of each voxel, and the first cell.
@@ -388,7 +387,7 @@ class PeopleFinder:
         Among people who stand close together before few cameras the hull is one block. Which of its columns are people
         is decided by the pixels that they explain.
         """
-        if len(part) * self._litres <= _LITRES[1]:
+        if len(part) * self._litres <= _MOST_LITRES:
             return [part]
         plan, cell, _ = self._plan(part)
         seeds = self._maxima(plan, 1.0, self._grid.voxel_m)
@@ -491,6 +490,6 @@ def _blurred(plan: Float, sigma: float) -> Float:
 
 
 def _around(volume: Volume, up: Float) -> Volume:
-    """Return the volume, larger on the floor by :data:`_BEYOND_M` on all sides and as high as a tall person."""
-    grown = np.array(volume.size) + 2 * _BEYOND_M * (1 - np.abs(up))
+    """Return the volume, larger on the floor by :data:`BEYOND_M` on all sides and as high as a tall person."""
+    grown = np.array(volume.size) + 2 * BEYOND_M * (1 - np.abs(up))
     return replace(volume, size=(float(grown[0]), float(grown[1]), float(grown[2])))

@@ -17,7 +17,7 @@ from tk.io.captures.source import Source
 from tk.io.results.data import JointAngles, ResultMeta
 from tk.io.settings_file import to_toml
 from tk.model.body.angles import ANGLES
-from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.anthropometry import AVERAGE_BODY
 from tk.model.body.skeleton import SEGMENTS, build_skeleton
 from tk.model.setup import Setup, Subject
 from tk.run.prefetch import TIMING_STAGES, Observations, open_observations
@@ -48,7 +48,7 @@ def _recording_setup(capture: Capture, options: RecordingOptions) -> Setup:
     first_frame = options.frames[0]
     setup = capture.setup()
     subjects: list[Subject] = []
-    names = build_skeleton(BodyDimensions.from_stature(1.7)).names
+    names = build_skeleton(AVERAGE_BODY).names
     for subject, given in zip(setup.subjects, capture.subjects, strict=True):
         first = not subjects
         init_file, body_file = (capture.path / name if name else None for name in (given.init, given.body))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError
 from tk.kernels.line_search import SearchSettings
 from tk.kernels.silhouette import descend, normal_equations
-from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.anthropometry import AVERAGE_BODY, BodyDimensions
 from tk.model.body.body_fit import INFORMATIVE_FRAMES, STATURE_DEVIATION, fit_body
 from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.initial_pose import rough_pose
@@ -87,7 +87,7 @@ class ContourFinder:
         self.world = TrackerFrame.of(rig, up)
         self.views = Views(self.world.rig)
         self.screen, self.choice = (RayGrid(self.world.rig, rows) for rows in (SCREEN_ROWS, CHOICE_ROWS))
-        skeleton = build_skeleton(BodyDimensions.from_stature(1.7))
+        skeleton = build_skeleton(AVERAGE_BODY)
         self.pose_names, self.pose_units = skeleton.names, skeleton.units
         self._body: ConeBody | None = None
         self.colors: PartColors
@@ -121,7 +121,7 @@ class ContourFinder:
 
     def prepare(self) -> None:
         """Compile the kernels; otherwise each is compiled when it is first called."""
-        body = build_cone_body(BodyDimensions.from_stature(1.7))
+        body = build_cone_body(AVERAGE_BODY)
         empty = np.zeros((len(self.views.rig), *self.views.rig.frame_shape), np.uint8)
         seen = self.views.pyramid(empty, 1, False)
         pose = np.zeros((1, len(body.skeleton.names)))

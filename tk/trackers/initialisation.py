@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError
 from tk.model.body import gait_poses as gait
-from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.anthropometry import AVERAGE_BODY
 from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.initial_pose import GREATEST_STATURE, LEAST_STATURE
 from tk.model.body.skeleton import Skeleton
@@ -286,7 +286,7 @@ def stature_of(finder: ContourFinder, pyramids: Sequence[Pyramid]) -> float:
     The area hardly changes when a person bends or raises the arms; the silhouette's height does. Girth and clothes
     cause an error of about 6 %. Median over the views of all frames, against the mean area of hanging and spread arms.
     """
-    body: ConeBody = build_cone_body(BodyDimensions.from_stature(AVERAGE_STATURE_M))
+    body: ConeBody = build_cone_body(AVERAGE_BODY)
     ratios: list[Float] = []
     for pyramid in pyramids:
         try:

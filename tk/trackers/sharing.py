@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.line_search import COLOR_BINS
+from tk.kernels.line_search import COLOR_BINS, MOST_LOG_RATIO
 from tk.kernels.mask_values import OTHERS
 from tk.kernels.raycast import FAR
 from tk.model.cameras.camera import Rig
@@ -40,9 +40,9 @@ ERROR_M = 0.04
 NEAR_M = 3 * ERROR_M
 # How far a pixel may lie from a body to be that person's, metres: a fist at 8 m/s moves so far in a frame at 15 Hz.
 REACH_M = 0.5
-# Logarithm of the ratio by which the colours around a pixel favour a person at most (2: 3.24, 5: 3.10). Edge of the
-# square over which the evidence of colours is averaged, pixels (1: 3.21, 5: 3.10, 9: 3.23).
-MOST_LOG_RATIO, _AVERAGED_PX = 3.0, 3
+# Edge of the square over which the evidence of colours is averaged, pixels (1: 3.21, 5: 3.10, 9: 3.23). The colours
+# around a pixel favour a person by MOST_LOG_RATIO at most (2: 3.24, 5: 3.10).
+_AVERAGED_PX = 3
 # A view shows somebody unknown if a connected region that is not near has this share of a person's area. A fast arm
 # that is not where it is expected has 0.05. Hulls expect nothing.
 UNKNOWN, UNKNOWN_BY_HULLS = 0.1, 0.03

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError
 from tk.kernels.nearest import SurfaceIndex
-from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.anthropometry import AVERAGE_BODY
 from tk.model.body.cone_body import ConeBody
 from tk.model.body.joints import CHAIN_OF_SEGMENT, CHAINS, JOINTS
 from tk.model.body.skeleton import build_skeleton, convert_poses
@@ -100,7 +100,7 @@ class VolumetricTracker:
         self.rig = rig
         self.hull = VisualHull(rig, VoxelGrid.cover(volume, config.voxels))
         self._finder = ContourFinder(rig, up, config.silhouette, fps)
-        skeleton = build_skeleton(BodyDimensions.from_stature(1.7), up, paper=True)
+        skeleton = build_skeleton(AVERAGE_BODY, up, paper=True)
         self.pose_names, self.pose_units = skeleton.names, skeleton.units
         self.skin: SuperellipsoidBody
         self._objective: BodyObjective

@@ -15,7 +15,7 @@ from tk.io.results.schema import ROWS as DATASETS
 from tk.io.results.schema import columns_of
 from tk.io.results.status import Status, has_pose
 from tk.io.toml import parse_toml
-from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.anthropometry import AVERAGE_BODY
 from tk.model.body.joints import JOINTS, ROWS, in_joint_order
 from tk.model.body.skeleton import paper_poses, skeleton_of_names
 from tk.model.cameras.camera import Rig
@@ -241,7 +241,7 @@ class Result:
             ResultError: the columns of `/pose` are not those of tk's skeleton.
         """
         try:
-            skeleton = skeleton_of_names(self.meta.pose_names, BodyDimensions.from_stature(1.75), self.meta.up)
+            skeleton = skeleton_of_names(self.meta.pose_names, AVERAGE_BODY, self.meta.up)
         except ValueError as error:
             raise ResultError(f"{self.path}: /pose: {error}") from error
         return paper_poses(skeleton, self.pose)

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 from tk.errors import ConfigError
+from tk.model.setup import AVERAGE_STATURE_M
 
 #: each of the :class:`BodyDimensions` as a fraction of the stature; radii and half widths are over light clothes
 FRACTIONS = {
@@ -104,3 +105,7 @@ class BodyDimensions:
     def stature(self) -> float:
         """Crown to sole when standing, metres."""
         return self.head + self.trunk + self.thigh + self.calf + self.ankle_height
+
+
+#: the average body, for a person of whom nothing is known, and where only the names of a skeleton matter
+AVERAGE_BODY = BodyDimensions.from_stature(AVERAGE_STATURE_M)

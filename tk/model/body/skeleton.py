@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tk.kernels.kinematics import ARM_UP, pack_tree
-from tk.model.body.anthropometry import FRACTIONS, RAISED_SHOULDERS, BodyDimensions
+from tk.model.body.anthropometry import AVERAGE_BODY, FRACTIONS, RAISED_SHOULDERS, BodyDimensions
 from tk.model.body.joints import (
     ARM,
     ARM_POLE,
@@ -301,7 +301,7 @@ def convert_poses(poses: Float, source: Skeleton, target: Skeleton) -> Float:
 
 def paper_poses(skeleton: Skeleton, poses: Float) -> Float:
     """Return poses (..., D) in the paper's degrees of freedom (..., 24); the hips are angles against the trunk."""
-    return convert_poses(poses, skeleton, build_skeleton(BodyDimensions.from_stature(1.75), paper=True))
+    return convert_poses(poses, skeleton, build_skeleton(AVERAGE_BODY, paper=True))
 
 
 def _with_waist_in_hips(skeleton: Skeleton, poses: Float) -> Float:

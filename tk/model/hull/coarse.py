@@ -23,8 +23,9 @@ Bool = NDArray[np.bool_]
 
 # Voxels along the volume's longest side for the person's hull: 5 cm of 2.4 m, which a thigh fills.
 _VOXELS = 48
-# Volume of a hull that may be a person's, litres, at least.
-_LEAST_LITRES = 10.0
+# Volume of a hull that may be a person's, litres, at least: a child of six weighs 20 kg (WHO growth reference), and a
+# part of it may be hidden.
+LEAST_LITRES = 10.0
 # A region of a mask belongs to the person within this many voxels of the hull: thin limbs contain no voxel's centre.
 _NEAR_VOXELS = 2.5
 # With this many cameras that see a voxel, one of them may be wrong, if the hull would otherwise shrink to this share.
@@ -181,7 +182,7 @@ class CoarseHull:
         sizes = np.array(
             [np.bincount(label[hull & (agreeing >= n)], minlength=count + 1) for n in range(2, len(masks) + 1)]
         )
-        large = sizes * self._litre >= _LEAST_LITRES
+        large = sizes * self._litre >= LEAST_LITRES
         level = int(np.flatnonzero(large.any(axis=1))[-1]) if large.any() else 0
         return np.asarray(label == sizes[level].argmax(), np.bool_) & hull
 
