@@ -24,6 +24,7 @@ from tk.io.captures.capture import Capture
 from tk.model.body.plausibility import fits_height
 from tk.model.cameras.common_view import sample_box, views_of
 from tk.model.cameras.up import up_vector
+from tk.model.cameras.volume import Volume
 from tk.model.hull.coarse import Hull
 from tk.model.masks.image_health import ImageHealth, Sampled, contradiction, sampled
 from tk.model.masks.mask_agreement import INCONSISTENT, Agreement, MaskAgreement
@@ -182,44 +183,23 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
     centers = np.unique(np.linspace(span // 4, last, _DELAY_FRAMES).round().astype(int)).tolist()
     near = {i + s for i in centers for s in range(-LARGEST_DELAY, LARGEST_DELAY + 1)} & set(range(span))
     kept = frames[np.linspace(0, len(frames) - 1, min(pictures, len(frames))).round().astype(int)]
-    notes: list[str] = list(capture.warnings)
-    label = make_labeller(Task.of(capture, config), notes.append)
-    watch = PeopleWatch(capture, span)
-    health, sick = ImageHealth(), np.zeros(len(capture.rig), int)
-    masks: dict[int, Masks] = {}
-    images: dict[int, NDArray[np.uint8]] = {}
-    small: dict[int, Sampled] = {}
-    with capture.frames(0, span) as reader:
-        for frame in reader:
-            compared = frame.index in near or frame.index in frames
-            if not compared and not watch.wants(frame.index):
-                continue
-            labels, uncertain, _ = label(frame)
-            if watch.wants(frame.index):
-                watch.look(frame.index, labels, uncertain)
-            if not compared:
-                continue
-            masks[frame.index] = labels.copy()
-            small[frame.index] = sampled(frame.images, labels)
-            sick += [reason is not None for reason in health.look(frame.images, masks[frame.index])]
-            if frame.index in kept:
-                images[frame.index] = frame.images.copy()
+    read = _read(capture, config, span, near | set(frames.tolist()), set(kept.tolist()))
+    notes, small, masks = read.notes, read.small, read.masks
     pairs = [(i + s, i + s + LARGEST_DELAY) for i in centers for s in (-LARGEST_DELAY, 0)]
     given = [(small[i], small[k]) for i, k in pairs if capture.has_masks and i in small and k in small]
     unrelated = contradiction(given)
     compare = MaskAgreement(capture.rig, capture.volume)
-    people, entered = watch.people(), watch.entered or 0
+    people, entered = read.watch.people(), read.watch.entered or 0
     if (later := frames >= entered).any():  # before it the masks show nobody, or people outside the volume
         kept, frames = kept[kept >= entered], frames[later]
         centers = [i for i in centers if i - LARGEST_DELAY >= entered] or centers
-    agreement = compare.compare([masks[int(i)] for i in frames])
+    agreement = compare.compare([masks[i] for i in frames.tolist()])
     if len(people) > 1:
-        own = {index: watch.of_first(index, m) for index, m in masks.items()}
-        alone = compare.compare([own[int(i)] for i in frames])
+        own = {index: read.watch.of_first(index, m) for index, m in masks.items()}
+        alone = compare.compare([own[i] for i in frames.tolist()])
         if not (alone.refusal or alone.wrong or alone.disagreement > INCONSISTENT):
             # the others are people, not what a turned camera shows of one person
             masks, agreement = own, alone
-    chosen = [masks[int(i)] for i in frames]
     late, sure = _delays(compare, masks, centers, agreement)
     for c in () if sure else np.flatnonzero(late).tolist():
         notes.append(
@@ -227,35 +207,87 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
             "masks say otherwise: it cannot be decided"
         )
         late[c] = 0
+    chosen = [masks[i] for i in frames.tolist()]
     hulls = compare.hulls([compare.possible(m) for m in chosen])
     good = agreement.right
     points = [hull.points(good) for hull in hulls if hull is not None]
-    leveling = find_up(capture.rig, capture.up, points)
-    p = np.concatenate(points) if points else np.zeros((0, 3))
-    edge = max(capture.volume.size) / 50
-    at_border = ((p < capture.volume.lower + edge) | (p > capture.volume.upper - edge)).any(axis=1)
     views = views_of(capture.rig, sample_box(capture.volume))
-    cameras = tuple(_camera(capture, chosen, c, agreement, int(late[c]), int(sick[c])) for c in range(len(capture.rig)))
     inspection = Inspection(
         capture=capture.name,
-        frames=tuple(int(i) for i in frames),
-        cameras=cameras,
+        frames=tuple(frames.tolist()),
+        cameras=tuple(
+            _camera(capture, chosen, c, agreement, int(late[c]), int(read.bad_images[c]))
+            for c in range(len(capture.rig))
+        ),
         with_hull=float(agreement.closes.mean()),
         extent_m=agreement.extent_m,
         seen_by_all=float((views == len(capture.rig)).mean()),
         seen_by_two=float((views >= 2).mean()),
-        at_border=float(at_border.mean()) if len(p) else float("nan"),
-        leveling=leveling,
+        at_border=_at_border(capture.volume, points),
+        leveling=find_up(capture.rig, capture.up, points),
         people=people,
         findings=(),
         notes=tuple(notes),
     )
     seen = [
-        Sample(int(i), images[int(i)], masks[int(i)], _silhouettes(hulls[list(frames).index(i)], good), compare.step)
-        for i in kept
+        Sample(i, read.images[i], masks[i], _silhouettes(hulls[frames.tolist().index(i)], good), compare.step)
+        for i in kept.tolist()
     ]
     findings = [*_findings(inspection, capture, agreement), *many_people(people, entered)]
     return replace(inspection, findings=tuple([unrelated, *findings] if unrelated else findings)), seen
+
+
+@dataclass(frozen=True)
+class _Read:
+    """What was read of a capture.
+
+    Attributes:
+        masks: (C, H, W) by frame index. images: (C, H, W, 3) likewise, of fewer frames. small: masks and images at a
+            small size, of the frames of ``masks``.
+        bad_images: (C,) number of blank or frozen images.
+        watch: has seen the people.
+        notes: what the capture and the segmentation report.
+    """
+
+    masks: dict[int, Masks]
+    images: dict[int, NDArray[np.uint8]]
+    small: dict[int, Sampled]
+    bad_images: NDArray[np.int64]
+    watch: PeopleWatch
+    notes: list[str]
+
+
+def _read(capture: Capture, config: Settings, span: int, compared: set[int], kept: set[int]) -> _Read:
+    """Decode and segment the first ``span`` frames; return the masks of the frames that are ``compared``, and the
+    images of those that are ``kept``."""
+    notes = list(capture.warnings)
+    label = make_labeller(Task.of(capture, config), notes.append)
+    read = _Read({}, {}, {}, np.zeros(len(capture.rig), np.int64), PeopleWatch(capture, span), notes)
+    health = ImageHealth()
+    with capture.frames(0, span) as reader:
+        for frame in reader:
+            i, watched = frame.index, read.watch.wants(frame.index)
+            if not watched and i not in compared:
+                continue
+            labels, uncertain, _ = label(frame)
+            if watched:
+                read.watch.look(i, labels, uncertain)
+            if i in compared:
+                read.masks[i] = labels.copy()
+                read.small[i] = sampled(frame.images, labels)
+                read.bad_images[:] += [reason is not None for reason in health.look(frame.images, read.masks[i])]
+            if i in kept:
+                read.images[i] = frame.images.copy()
+    return read
+
+
+def _at_border(volume: Volume, points: Sequence[NDArray[np.float64]]) -> float:
+    """Return the share of the points (N, 3) of all hulls at the border of the working volume; NaN without any."""
+    if not points:
+        return float("nan")
+    p, edge = np.concatenate(points), max(volume.size) / 50
+    at_border = ((p < volume.lower + edge) | (p > volume.upper - edge)).any(axis=1)
+    return float(at_border.mean()) if len(p) else float("nan")
 
 
 def _delays(
