@@ -12,7 +12,6 @@ from typing import Any
 from tk.errors import ConfigError
 
 SEGMENTATIONS = ("collinearity", "mog2")
-EFFORTS = {"fast": 0.5, "normal": 1.0, "thorough": 5.0}
 
 #: largest count in a settings file: frames, points, iterations
 MOST_COUNT = 100_000
@@ -125,9 +124,9 @@ class Settings:
         segmentation: "collinearity" (the paper's) or "mog2".
         ahead: frames that a separate process decodes and segments ahead of the tracker; 0: no such process, each frame
             is prepared when the tracker asks for it. The result is the same.
-        effort: how much the volumetric tracker computes: "fast", "normal", "thorough", or a number. "normal" is 1, the
-            paper's numbers of iterations and points (6.4). A number below 1 is the share of the iterations, a number
-            above 1 multiplies the points: "thorough" is 5, which the paper compares in its section 7.3.
+        effort: how much the volumetric tracker computes. 1: the paper's numbers of iterations and points (6.4). A
+            number below 1 is the share of the iterations, a number above 1 multiplies the points; the paper compares
+            1 and 5 in its section 7.3.
         refine: whether inconsistent cameras are refined before the second pass.
         resample: whether each frame's images are chosen by their time stamps, for cameras of different or variable
             rates. A frame for which a camera has no image within half an interval is blank in this camera.
@@ -140,7 +139,7 @@ class Settings:
     seed: int = 0
     segmentation: str = "collinearity"
     ahead: int = 4
-    effort: str | float = "normal"
+    effort: float = 1.0
     refine: bool = True
     resample: bool = False
     person_pixels: int = 240
@@ -160,12 +159,5 @@ class Settings:
             raise ConfigError(f"ahead = {self.ahead}: choose from 0 to 64 frames")
         if not 0 <= self.person_pixels <= MOST_COUNT:
             raise ConfigError(f"person_pixels = {self.person_pixels}: choose from 0 (full size) to {MOST_COUNT}")
-        if isinstance(self.effort, str) and self.effort not in EFFORTS:
-            raise ConfigError(f'effort = "{self.effort}": choose one of {", ".join(EFFORTS)}, or a number')
-        if not 0.05 <= self.effort_factor <= 20:
+        if not 0.05 <= self.effort <= 20:
             raise ConfigError(f"effort = {self.effort}: choose from 0.05 to 20; 1 is normal")
-
-    @property
-    def effort_factor(self) -> float:
-        """``effort`` as a number."""
-        return EFFORTS[self.effort] if isinstance(self.effort, str) else self.effort

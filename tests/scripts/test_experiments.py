@@ -72,7 +72,7 @@ def test_optimisers_differ_only_in_the_optimiser_and_the_number_of_points(
     assert [(optimise is smd, config.effort) for config, _, optimise, _ in asked] == [
         (True, 1), (True, 5), (False, 1), (False, 5),
     ]  # fmt: skip
-    same = {replace(config, effort="normal") for config, *_ in asked}
+    same = {replace(config, effort=1.0) for config, *_ in asked}
     assert same == {Settings()}
 
 

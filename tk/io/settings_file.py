@@ -6,7 +6,7 @@ import dataclasses
 import math
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 import tomli_w
 
@@ -69,10 +69,9 @@ def _build(default: T, values: dict[str, Any], where: str, path: str = "") -> T:
                 raise ConfigError(f"{where}: {name} must be a table")
             changes[key] = _build(old, value, where, f"{name}.")
             continue
-        kinds = get_args(hints[key]) or (hints[key],)
-        if float in kinds and type(value) is int:
+        if hints[key] is float and type(value) is int:
             changes[key] = float(value)
-        elif type(value) not in kinds:
+        elif type(value) is not hints[key]:
             raise ConfigError(f"{where}: {name} = {shown(value)} must be of type {type(old).__name__}, as {old!r} is")
         elif isinstance(value, float) and not math.isfinite(value):
             raise ConfigError(f"{where}: {name} = {value} must be a finite number")

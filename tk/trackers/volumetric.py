@@ -95,7 +95,7 @@ class VolumetricTracker:
 
     def __init__(self, rig: Rig, volume: Volume, up: str, config: Settings, fps: float = 15.0) -> None:
         self.config = config
-        self.scale, self.iterations = points_and_iterations(config.effort_factor)
+        self.scale, self.iterations = points_and_iterations(config.effort)
         self.up = up
         self.rig = rig
         self.hull = VisualHull(rig, VoxelGrid.cover(volume, config.voxels))
