@@ -26,7 +26,7 @@ from tk.errors import ConfigError, VideoError, WorkerError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.reader import read_result
-from tk.run import prefetch, session, worker
+from tk.run import loop, prefetch, worker
 from tk.run.prefetch import Ahead, Observations, Serial, open_observations
 from tk.run.task import Task
 from tk.settings import Settings
@@ -139,7 +139,7 @@ def test_a_defect_keeps_its_traceback(tiny: Path) -> None:
 
 
 def test_a_killed_process_is_reported_in_one_line(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "WRITE_EVERY_S", 0)
+    monkeypatch.setattr(loop, "WRITE_EVERY_S", 0)
 
     class Killer(Silent):
         def advance(self, frame: int, estimate: object) -> None:

@@ -30,7 +30,7 @@ from tk.io.results.reader import read_joints, read_result
 from tk.io.results.status import Status
 from tk.io.toml import load_toml
 from tk.model.body.skeleton import JOINTS
-from tk.run import session
+from tk.run import loop
 from tk.run.plan import choose_frames
 from tk.run.session import Summary
 from tk.trackers.registry import tracker_class
@@ -43,10 +43,10 @@ track = partial(conftest.track, method="volumetric")
 VICTIM = """
 import os, signal, sys
 from tk.commands import console
-from tk.run import session
+from tk.run import loop
 from tk import cli
 
-session.WRITE_EVERY_S = float(os.environ["TEST_WRITE_EVERY_S"])
+loop.WRITE_EVERY_S = float(os.environ["TEST_WRITE_EVERY_S"])
 tell = console.ConsoleReporter.advance
 
 def advance(self, frame, estimate):
@@ -116,7 +116,7 @@ def test_another_seed_gives_another_result(tiny: Path, tracked: Path, tmp_path: 
 def test_a_run_interrupted_twice_equals_an_uninterrupted_one(
     tiny: Path, tracked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session, "WRITE_EVERY_S", 0)
+    monkeypatch.setattr(loop, "WRITE_EVERY_S", 0)
     result, capture = tmp_path / "r.h5", open_capture(tiny)
     for frame in (0, 8):
         summary = track(capture, result, CONFIG, stop_at(frame), resume=True, store_hull=True)
@@ -131,7 +131,7 @@ def test_a_run_interrupted_twice_equals_an_uninterrupted_one(
 def test_frames_are_reported_after_they_are_written(
     tiny: Path, tracked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session, "WRITE_EVERY_S", 1e9)
+    monkeypatch.setattr(loop, "WRITE_EVERY_S", 1e9)
     result, capture = tmp_path / "r.h5", open_capture(tiny)
     stopped = stop_at(3)
     summary = track(capture, result, CONFIG, stopped, frames=(0, 8), store_hull=True)
@@ -244,7 +244,7 @@ def test_results_of_other_software_are_not_resumed(tk: Tk, quick: Path, tiny: Pa
 
 def test_lost_frames_of_all_runs_are_counted(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody is there in frames 3 to 5; the run is stopped in their midst."""
-    monkeypatch.setattr(session, "WRITE_EVERY_S", 0)
+    monkeypatch.setattr(loop, "WRITE_EVERY_S", 0)
     for camera in (copy / "masks").iterdir():
         for index in (3, 4, 5):
             write_picture(camera / f"{index:06d}.png", np.zeros((120, 160), np.uint8))

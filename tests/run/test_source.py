@@ -24,7 +24,7 @@ from tk.io.results.reader import read_result
 from tk.io.results.status import Status
 from tk.model.cameras.volume import Volume
 from tk.model.setup import Setup, Subject
-from tk.run import offline, session
+from tk.run import loop, offline
 from tk.run.people import Member, People
 from tk.run.session import estimates, track_task
 from tk.run.task import Choice, Task, TrackOptions
@@ -135,7 +135,7 @@ def test_a_run_that_began_with_an_empty_volume_is_resumed(
             if frame == stop:
                 raise KeyboardInterrupt
 
-    monkeypatch.setattr(session, "WRITE_EVERY_S", 0)
+    monkeypatch.setattr(loop, "WRITE_EVERY_S", 0)
     whole, part = tmp_path / "whole.h5", tmp_path / "part.h5"
     track_task(task(SETUP, LATE), whole, Silent())
     stopped = track_task(task(SETUP, LATE), part, Stop())

@@ -16,7 +16,6 @@ from tk.model.hull.hull import VisualHull
 from tk.run.plan import choose_frames
 from tk.run.reporter import Reporter
 from tk.run.segmentation import make_labeller
-from tk.run.session import points_of
 from tk.run.task import Task
 from tk.settings import Settings
 
@@ -70,7 +69,7 @@ def reconstruct(
         with capture.frames(start, stop) as reader:
             for frame in reader:
                 hull.update(label(frame).masks)
-                points: HullPoints = points_of(hull.surface(frame.images))
+                points = HullPoints.of(hull.surface(frame.images))
                 if ply is not None:
                     write_ply(ply_path(ply, frame.index), points.positions, points.colors)
                 if mesh is not None:

@@ -1,39 +1,31 @@
-"""The loop of a run: step the trackers through a source, write the result, report progress, resume."""
+"""A run: track a recording or another source, write the result frame by frame, and finish it."""
 
 from __future__ import annotations
 
-import logging
-import math
 import time
 from collections import defaultdict
-from collections.abc import Callable, Container, Iterator, Mapping
-from dataclasses import dataclass, replace
-from itertools import chain, islice
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from tk.errors import CaptureError, ResultError, TkError
 from tk.io.captures.capture import Capture
 from tk.io.captures.mask_store import MaskStores
-from tk.io.results.data import HullPoints, Value
 from tk.io.results.files import check_result_path
-from tk.io.results.reader import as_damage_error, read_people, read_result
+from tk.io.results.reader import read_people
 from tk.io.results.revision import revise_result
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
-from tk.model.hull.hull import HullSurface
-from tk.run.offline import REFINED, finish, report_suspect, report_unknown
-from tk.run.people import People, Tracked
-from tk.run.plan import Plan, open_plan, recording_task
-from tk.run.prefetch import Observed
+from tk.run.loop import Loop, Output
+from tk.run.offline import finish, report_suspect, report_unknown
+from tk.run.plan import open_plan, recording_task
 from tk.run.reporter import Reporter
 from tk.run.task import RecordingOptions, Task
 from tk.threads import one_thread
-from tk.trackers.protocol import Estimate, Observation, shows_person, two_pass
-
-_LOG = logging.getLogger(__name__)
+from tk.trackers.protocol import Estimate
 
 
 @dataclass(frozen=True)
@@ -128,21 +120,21 @@ def track_task(task: Task, output: Path, reporter: Reporter, resume: bool = Fals
         if not (done or again):
             stores.remove()  # of a stopped run; with a second pass, the first frame replaces them
         masks = stores if again else None
-        run = _Run(plan, note, _Output(writer, done, plan.origin()), masks)
+        loop = Loop(plan, note, Output(writer, done, plan.origin()), masks)
         started = time.perf_counter()
         interrupted = False
         try:
             with writer:
                 reporter.begin(plan.total, min(done, plan.total) if plan.total else done)
-                for frame, estimates in enumerate(run.frames(), plan.begin + done):
+                for frame, estimates in enumerate(loop.frames(), plan.begin + done):
                     reporter.advance(frame, estimates[0] if estimates else None)
-            if run.tracked or run.restore_unfinished(output):
-                if lines := run.people.report():  # a damaged image may be the cause
-                    lines = [*task.source.damaged(plan.begin + done + run.tracked), *lines]
+            if loop.tracked or loop.restore_unfinished(output):
+                if lines := loop.people.report():  # a damaged image may be the cause
+                    lines = [*task.source.damaged(plan.begin + done + loop.tracked), *lines]
                 for line in lines:
                     note(line)
                 with one_thread():
-                    finish(output, task, run.people, masks, note, reporter.within, run.finished)
+                    finish(output, task, loop.people, masks, note, reporter.within, loop.finished)
                 if said:
                     revise_result(output, notes=said)
             stores.remove()
@@ -150,11 +142,11 @@ def track_task(task: Task, output: Path, reporter: Reporter, resume: bool = Fals
             # caught outside the writer, which then keeps an older result if no frame is finished
             interrupted = True
         finally:
-            if not done + run.tracked:
+            if not done + loop.tracked:
                 stores.remove()
-        tracks = read_people(output) if done + run.tracked else ()
+        tracks = read_people(output) if done + loop.tracked else ()
         status = [track.status for track in tracks if track.status is not None] or [np.zeros(0, np.uint8)]
-        return Summary(np.concatenate(status), time.perf_counter() - started, run.tracked, interrupted, len(status))
+        return Summary(np.concatenate(status), time.perf_counter() - started, loop.tracked, interrupted, len(status))
 
 
 def estimates(task: Task, note: Callable[[str], None] = lambda _: None) -> Iterator[Estimate]:
@@ -167,292 +159,18 @@ def estimates(task: Task, note: Callable[[str], None] = lambda _: None) -> Itera
     for line in task.notes:
         note(line)
     with open_plan(task, note) as plan:
-        run = _Run(plan, note)
+        loop = Loop(plan, note)
         unknown: defaultdict[int, list[int]] = defaultdict(list)  # by person
         suspect: defaultdict[int, list[int]] = defaultdict(list)
-        for estimate in chain.from_iterable(run.frames()):
+        for estimate in chain.from_iterable(loop.frames()):
             if estimate.status == "suspect":
                 suspect[estimate.person].append(estimate.frame)
             found = estimate.status not in ("lost", "absent")
             if found and estimate.sigma is not None and np.isnan(estimate.sigma).all():
                 unknown[estimate.person].append(estimate.frame)
             yield estimate
-        for line in run.people.report():
+        for line in loop.people.report():
             note(line)
-        for person in range(len(run.people.members)):
+        for person in range(len(loop.people.members)):
             report_unknown(unknown[person], note)
             report_suspect(suspect[person], note)
-
-
-# Seconds between two writes to the file; frames finished within this time are written and reported together. A shorter
-# time costs more writes; a longer one loses more frames when the process is killed.
-WRITE_EVERY_S = 0.5
-
-# Most bytes of the frames that are held at the start, and least number of these frames: of eight 4K cameras at full
-# size 12 instead of 24. Fewer frames make the body less certain, see tk.model.body.body_fit.
-_OPENING_BYTES, _LEAST_OPENING = 4_000_000_000, 8
-
-_ORIGIN = "run/"
-
-
-@dataclass
-class _Output:
-    """The result file of a run.
-
-    Attributes:
-        done: number of frames that an earlier run has finished.
-        origin: what must agree with the earlier run.
-    """
-
-    writer: ResultWriter
-    done: int
-    origin: Mapping[str, str]
-
-    def check(self) -> None:
-        """Raise ResultError if the earlier run had other inputs or settings."""
-        for name, value in self.origin.items():
-            found = self.writer.state.get(_ORIGIN + name)
-            if found != value:
-                raise ResultError(
-                    f"{self.writer.path}: was made differently: {name}: {found}, not {value}",
-                    hint="start again with --force instead of --resume",
-                )
-
-    def check_open(self) -> None:
-        """Raise ResultError if no frames can be added, because the second pass has changed the earlier ones."""
-        if any(REFINED in model for model in self.writer.models):
-            raise ResultError(
-                f"{self.writer.path}: a second pass has gone over its frames, so no more can be added; only a causal "
-                "result can be continued",
-                hint="start again with --force instead of --resume",
-            )
-
-
-class _Run:
-    """One run of trackers through a source. ``tracked`` counts frames, even if the run is interrupted; ``finished`` are
-    the people whose result an earlier run has finished."""
-
-    def __init__(
-        self,
-        plan: Plan,
-        note: Callable[[str], None],
-        output: _Output | None = None,
-        masks: MaskStores | None = None,
-    ) -> None:
-        self.plan, self.output, self.masks, self._note = plan, output, masks, note
-        self.tracked = 0
-        self._held: list[dict[int, dict[str, ArrayLike]]] = []  # rows of frames that are not in the file yet
-        self.finished: Container[int] = ()
-        self.people = People(plan.task, plan.tracker, note)
-
-    def frames(self) -> Iterator[tuple[Estimate, ...]]:
-        """Start or restore the trackers, step them to the end and yield the estimates of each frame's people; they are
-        in the file already, except those before the first person, which are written with that person's first frame.
-
-        Raises:
-            TkError: bad input, or nobody is found.
-        """
-        plan, output = self.plan, self.output
-        done = output.done if output else 0
-        if plan.stop is not None and plan.begin + done >= plan.stop:
-            return
-        if output and done:
-            output.check()
-            output.check_open()
-            self._restore(output)
-            yield from self._step_through(plan.observations.frames(plan.begin + done, plan.stop))
-            return
-        # The body is fitted to the same frames however few are asked for, so that --resume may extend a run.
-        count = self._opening_frames()
-        observations = plan.observations.frames(plan.first, None if plan.stop is None else plan.stop + count)
-        _LOG.info("reading the first frames and learning what the scene looks like")
-        plan.tracker.prepare()
-        yield from self._step_through(self._started(observations, count))
-        if not self.people.members:
-            raise CaptureError(f"{plan.task.source.where}: nobody could be tracked: {self.people.refusal}")
-
-    def _started(self, observations: Iterator[Observed], count: int) -> Iterator[Observed]:
-        """Yield the observations; start the trackers before the first frame with somebody in the volume is yielded.
-
-        Args:
-            observations: from the first frame on.
-            count: number of frames that the body is fitted to.
-        """
-        opening: list[Observed] = []
-        observations = _fill(opening, observations, count)
-        source, stop = self.plan.task.source, self.plan.stop
-        while opening and (stop is None or opening[0][0].index < stop):
-            try:
-                with one_thread():
-                    if self.people.start([o for o, _ in opening], source.has_masks):
-                        break
-            except CaptureError as error:
-                reasons = "; ".join([str(error), *source.damaged(opening[-1][0].index + 1)])
-                raise CaptureError(f"{source.where}: {reasons}", error.hint) from None
-            yield opening.pop(0)
-            observations = _fill(opening, observations, count)
-        opening.reverse()
-        while opening:
-            yield opening.pop()  # images are large
-        yield from observations
-
-    def _opening_frames(self) -> int:
-        """Return the number of frames that the body is fitted to: fewer where the images are large."""
-        task, count = self.plan.task, self.plan.tracker.opening_frames
-        rig = task.setup.rig
-        held = 5 * len(rig) * math.prod(rig.frame_shape)  # bytes of a frame: image, mask and uncertain pixels
-        fewer = min(count, max(_OPENING_BYTES // held, _LEAST_OPENING))
-        if fewer < count:
-            self._note(
-                f"{task.source.where}: the images are large; the body is fitted to {fewer} frames instead of {count}"
-            )
-        return fewer
-
-    def restore_unfinished(self, path: Path) -> bool:
-        """Restore the trackers if all frames are written but the result is not finished; return whether that is so."""
-        output, tracker = self.output, self.plan.tracker
-        if output is None or not output.done or not tracker.has_segments:
-            return False
-        one_pass = self.plan.task.options.causal or not tracker.has_second_pass
-        self.finished = {
-            person
-            for person, (model, result) in enumerate(zip(output.writer.models, read_result(path).people, strict=True))
-            if result.smoothed is not None and (one_pass or REFINED in model)
-        }
-        if len(self.finished) == len(output.writer.models):
-            return False
-        output.check()
-        self._restore(output)
-        return True
-
-    def _restore(self, output: _Output) -> None:
-        with as_damage_error(output.writer.path, "the state of the run"):
-            self.people.restore(output.writer.models, output.writer.state)
-
-    def _step_through(self, observations: Iterator[Observed]) -> Iterator[tuple[Estimate, ...]]:
-        """Step the trackers to the end; estimates are yielded when they are in the file."""
-        output, stop = self.output, self.plan.stop
-        finished: list[tuple[Estimate, ...]] = []
-        written, writing = -np.inf, 0.0  # the first frame is written at once
-        try:
-            for observation, laps in observations:
-                if stop is not None and observation.index >= stop:
-                    break
-                started = time.perf_counter()
-                estimates = self._step(observation)
-                if estimates is None:
-                    continue
-                stepped = time.perf_counter()
-                total = laps["wait"] + writing + stepped - started
-                estimates = tuple(replace(e, timing={**laps, **e.timing, "total": total}) for e in estimates)
-                due = not output or stepped - written > WRITE_EVERY_S
-                if output:
-                    self._held.append({e.person: _row(e, self.plan.task.options.store_hull) for e in estimates})
-                    if self.people.members:
-                        self._write(output, due)
-                finished.append(estimates)
-                writing = time.perf_counter() - stepped
-                if due:
-                    written = stepped + writing
-                    yield from finished
-                    finished.clear()
-        except TkError:  # frames before the broken one count
-            yield from self._written(finished)
-            raise
-        yield from self._written(finished)
-
-    def _write(self, output: _Output, flush: bool) -> None:
-        """Write the frames that are not in the file yet, and the bodies of people whose trackers have just started."""
-        models = output.writer.models
-        for member in self.people.members:
-            if member.number >= len(models) or not models[member.number]:
-                output.writer.write_model(member.tracker.model(), person=member.number)
-        *earlier, last = self._held
-        for absent in earlier:  # with the nearest pose, as later absent frames
-            rows = {n: row | {k: last[n][k] for k in ("pose", "joints/position")} for n, row in absent.items()}
-            output.writer.append(rows, flush=False)
-        output.writer.append(last, self._state(output), flush=flush)
-        self.tracked += len(self._held)
-        self._held.clear()
-
-    def _step(self, observation: Observation) -> tuple[Estimate, ...] | None:
-        """Step all trackers; return the estimates of the people who are present, None before the first frame to be
-        written."""
-        with one_thread():
-            answers = self.people.step(observation)
-        if observation.index < self.plan.begin:
-            return None
-        present = []
-        for number, answer in answers.items():
-            estimate = answer.estimate
-            if estimate.status == "absent" and self.people.several:
-                continue
-            if self.masks is not None:
-                self.masks[number].put(observation.index, self._kept(answer))
-            # masks are large, and a view into the ring of frames: an estimate must not keep them
-            whole = replace(estimate, frame=observation.index, time=observation.time, person=number)
-            present.append(replace(whole, masks=None, drawn=None, mask_source=observation.sources))
-        return tuple(present)
-
-    def _kept(self, answer: Tracked) -> NDArray[np.uint8]:
-        """Return the cleaned masks (C, H, W) of a frame, including those of excluded cameras, which may be refined."""
-        tracker = two_pass(self.plan.tracker)
-        assert tracker is not None
-        taken = tracker.cleaned(answer.used.masks) if answer.estimate.masks is None else answer.estimate.masks
-        out = shows_person(answer.share.masks) & ~shows_person(answer.used.masks)
-        if out.any():
-            taken = taken.copy()
-            taken[out] = tracker.cleaned(answer.share.masks[out])
-        return taken
-
-    def _written(self, finished: list[tuple[Estimate, ...]]) -> Iterator[tuple[Estimate, ...]]:
-        if self.output and self.tracked:
-            self.output.writer.flush()
-        yield from finished
-
-    def _state(self, output: _Output) -> Mapping[str, Value]:
-        origin = {_ORIGIN + name: value for name, value in output.origin.items()}
-        return {**self.people.state(), **origin}
-
-
-def _fill(taken: list[Observed], observations: Iterator[Observed], count: int) -> Iterator[Observed]:
-    """Take observations until there are ``count``, and return the others. If one after the first cannot be read, the
-    others raise the error."""
-    try:
-        taken.extend(islice(observations, count - len(taken)))
-    except TkError as error:
-        if not taken:
-            raise
-        return _raising(error)
-    return observations
-
-
-def _raising(error: TkError) -> Iterator[Observed]:
-    raise error
-    yield
-
-
-def _row(estimate: Estimate, store_hull: bool) -> dict[str, ArrayLike]:
-    """Return an estimate's row of the result file."""
-    row: dict[str, ArrayLike | None] = {
-        "frames": estimate.frame,
-        "time": estimate.time,
-        "pose": estimate.pose,
-        "joints/position": estimate.joints,
-        "joints/sigma": estimate.sigma,
-        "residual": estimate.residual,
-        "mask_source": estimate.mask_source,
-        "status": int(Status[estimate.status.upper()]),
-        "objective": estimate.objective,
-        "iterations": estimate.iterations,
-        **{f"timing/{stage}": seconds for stage, seconds in estimate.timing.items()},
-    }
-    if store_hull and estimate.surface is not None:
-        points = points_of(estimate.surface)
-        row |= {"hull/positions": points.positions, "hull/colors": points.colors}
-    return {path: value for path, value in row.items() if value is not None}
-
-
-def points_of(surface: HullSurface) -> HullPoints:
-    """Return a hull's surface as a result stores it: colours RGB, uint8."""
-    return HullPoints(surface.positions, surface.colors[:, ::-1].round().clip(0, 255).astype(np.uint8))

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
+    from tk.model.hull.hull import HullSurface
+
 Float = NDArray[np.float64]
 Value = NDArray[Any] | float | int | str
 
@@ -115,6 +117,11 @@ class HullPoints:
 
     positions: NDArray[np.floating]
     colors: NDArray[np.uint8]
+
+    @classmethod
+    def of(cls, surface: HullSurface) -> HullPoints:
+        """Return the voxels of a hull's surface."""
+        return cls(surface.positions, surface.colors[:, ::-1].round().clip(0, 255).astype(np.uint8))
 
 
 @dataclass(frozen=True)
