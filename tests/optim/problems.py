@@ -61,14 +61,6 @@ def rippled(phases: Float, amplitude: float = 0.3, frequency: float = 9.0) -> Ob
     return evaluate
 
 
-def rosenbrock(poses: Float, directions: Float, iteration: int) -> Evaluation:
-    x, y = poses.T
-    gradient = np.stack([-400 * x * (y - x**2) - 2 * (1 - x), 200 * (y - x**2)], axis=1)
-    u, w = directions.T
-    product = np.stack([(1200 * x**2 - 400 * y + 2) * u - 400 * x * w, -400 * x * u + 200 * w], axis=1)
-    return Evaluation(100 * (y - x**2) ** 2 + (1 - x) ** 2, gradient, product)
-
-
 def cliff(poses: Float, directions: Float, iteration: int) -> Evaluation:
     """(x² + 100 y²)²: its gradient grows with the cube of the distance."""
     weights = np.array([1.0, 100.0])

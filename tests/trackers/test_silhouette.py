@@ -6,9 +6,7 @@ import pytest
 from tests.model.figures import draw_silhouettes, scaled
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, NAMES, STATURE, errors, find_again_elsewhere, observe, walk
-from tk.errors import CaptureError
 from tk.model.body.cone_body import build_cone_body
-from tk.model.body.skeleton import JOINTS
 from tk.model.setup import InitPose, Subject
 from tk.settings import SilhouetteSettings
 from tk.trackers.silhouette import SilhouetteTracker
@@ -63,24 +61,6 @@ def test_a_walk_is_tracked_and_resumed_bit_for_bit():
         np.testing.assert_array_equal(second.step(observe(MASKS[i], i)).pose, estimates[i].pose)
 
 
-def test_the_subject_is_found_without_an_initial_pose():
-    config = SilhouetteSettings(adapt=False)
-    tracker = SilhouetteTracker(RIG, "z", config)
-    tracker.start([observe(m, i) for i, m in enumerate(MASKS)], Subject(STATURE))
-    estimate = tracker.step(observe(MASKS[0]))
-    assert errors(estimate, POSES[0]).mean() < CLOSE_M
-    sides = [JOINTS.index(name) for name in ("ankle_l", "ankle_r")]
-    truth = BODY.skeleton.joints(POSES[0])[sides]
-    found = estimate.joints[sides]
-    assert np.linalg.norm(found - truth) < np.linalg.norm(found[::-1] - truth)
-
-
-def test_stature_is_estimated_from_the_silhouettes():
-    tracker = SilhouetteTracker(RIG, "z", SilhouetteSettings(adapt=False))
-    tracker.start([observe(MASKS[0])], Subject())
-    assert tracker.body.dimensions.stature == pytest.approx(STATURE, rel=0.06)
-
-
 def test_start_adapts_the_body_dimensions():
     thick = scaled(BODY.dimensions, thigh_radius=1.25, head_radius=1.15)
     masks = draw_silhouettes(build_cone_body(thick), RIG, POSES[:3])
@@ -109,11 +89,6 @@ def test_a_person_who_returns_at_another_place_is_found():
     find_again_elsewhere(tracker_at(POSES[0]), RIG, POSES[:3], 2 * CLOSE_M)
 
 
-def test_an_empty_first_frame_is_reported():
-    tracker = SilhouetteTracker(RIG, "z")
-    masks = MASKS[0].copy()
-    masks[1:] = 0
-    with pytest.raises(CaptureError, match="1 of 3 masks of frame 7 show anybody"):
-        tracker.start([observe(masks, 7)], Subject())
+def test_a_tracker_that_was_not_started_says_so():
     with pytest.raises(RuntimeError, match="no body yet"):
-        tracker.step(observe(MASKS[0]))
+        SilhouetteTracker(RIG, "z").step(observe(MASKS[0]))
