@@ -25,7 +25,8 @@ from tk.io.results.status import Status
 from tk.model.cameras.volume import Volume
 from tk.model.setup import Setup, Subject
 from tk.run import loop, offline
-from tk.run.people import Member, People
+from tk.run.member import Member
+from tk.run.people import People
 from tk.run.session import estimates, track_task
 from tk.run.task import Choice, Task, TrackOptions
 from tk.trackers.protocol import Observation

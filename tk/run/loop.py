@@ -19,8 +19,9 @@ from tk.io.results.data import HullPoints, Value
 from tk.io.results.reader import as_damage_error, read_result
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
+from tk.run.member import Tracked
 from tk.run.offline import REFINED
-from tk.run.people import People, Tracked
+from tk.run.people import People
 from tk.run.plan import Plan
 from tk.run.prefetch import Observed
 from tk.threads import one_thread

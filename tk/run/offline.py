@@ -23,7 +23,8 @@ from tk.model.masks.image_health import described
 from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
 from tk.run.identity import COLUMNS, EXCHANGED, UNCLEAR, doubtful, exchange_masks, exchanged, report
-from tk.run.people import Member, People
+from tk.run.member import Member
+from tk.run.people import People
 from tk.run.prefetch import open_observations
 from tk.run.refinement import compare_cameras, refine_if_inconsistent, retimed
 from tk.run.task import Task

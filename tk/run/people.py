@@ -14,14 +14,12 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ConfigError
 from tk.kernels.mask_values import OTHERS
@@ -33,19 +31,16 @@ from tk.model.people import LocatedPerson, PeopleFinder, order_people
 from tk.model.setup import Subject
 from tk.run.choice import chosen, matched, unknown
 from tk.run.identity import EXCHANGED, UNCLEAR, Contact, Contacts, outcome_of
+from tk.run.member import Member, Tracked, below
 from tk.run.task import Task
 from tk.trackers.camera_monitor import CameraMonitor, opening_agreement, spread_over
-from tk.trackers.protocol import Estimate, Observation, SharingTracker, Tracker, sharing
-from tk.trackers.sharing import UNKNOWN, UNKNOWN_BY_HULLS, PixelOwners, assign, cast_points
+from tk.trackers.protocol import Estimate, Observation, Tracker, sharing
+from tk.trackers.sharing import UNKNOWN_BY_HULLS, PixelOwners, assign, cast_points
 
 _LOG = logging.getLogger(__name__)
-Float = NDArray[np.float64]
 
 # Seconds between two searches for people who enter.
 LOOK_EVERY_S = 0.5
-# Pixels farther from the body of a person who is alone than this, metres, may show somebody else: more than half a
-# frame's motion of a fist.
-_ALONE_M = 0.25
 # Frames of the opening in which other people are searched for if the person in the first frame cannot be tracked.
 _TESTED = 4
 # Frames of somebody who enters to which the body is fitted: half a second at 15 Hz.
@@ -59,34 +54,9 @@ _UNEXPLAINED = 0.25
 # colours and body: -0.1 to -0.7 for the same person, -1.6 to -3.7 for the other one.
 _SAME_COLORS = -1.1
 
-_DRAWN, _PLACE = "drawn", "place"
-_WATCH, _LOST, _ABSENT, _PEOPLE = "watch/", "lost", "absent", "people/"
+_PEOPLE = "people/"
 _SUBJECT, _IN_INIT_POSE = "subject", "in_init_pose"  # the number of the subject, -1: unknown
 _MODEL, _CONTACTS = "body/", "contacts/"
-
-
-@dataclass
-class Member:
-    """A person who is tracked."""
-
-    number: int  # in the result; people who are not written have higher numbers
-    subject: Subject  # what is known of the person
-    tracker: Tracker
-    monitor: CameraMonitor
-    written: bool = True  # whether the person is in the result
-    lost: bool = False  # in the last frame
-    absent: bool = False  # nobody was seen in the last frame who could be this person
-    drawn: NDArray[np.bool_] | None = None  # (C, h, w) the body in the last frame that is not lost, see `Estimate`
-    place: Float | None = None  # (3,) m, mean of the joints in that frame
-
-
-@dataclass(frozen=True)
-class Tracked:
-    """A member's answer for a frame: the estimate, the member's share of the frame, and what its tracker used."""
-
-    estimate: Estimate
-    share: Observation
-    used: Observation
 
 
 class People:
@@ -288,9 +258,9 @@ class People:
             nobody = replace(self._nobody, status="lost" if self._refused else "absent")
             return {} if self.several else {0: Tracked(nobody, frame, frame)}
         owners: PixelOwners | None = None
-        if len(self._tracked) == 1 and not self._shows_others(frame):
+        if len(self._tracked) == 1 and not self._tracked[0].shows_others(frame.masks, self._setup.rig):
             (member,) = self._tracked
-            answers = {member.number: self._step(member, frame)}
+            answers = {member.number: member.step(frame)}
             self._unknown.clear()
         else:
             answers, owners = self._step_all(frame)
@@ -304,29 +274,11 @@ class People:
                 answers[member.number] = replace(answer, estimate=replace(answer.estimate, status="absent"))
         return {m.number: answers[m.number] for m in self.members if m.number in answers}
 
-    def _shows_others(self, frame: Observation) -> bool:
-        """Return whether a view shows more than the only person who is tracked: pixels far from the last body."""
-        (member,) = self._tracked
-        tracker = sharing(member.tracker)
-        if tracker is None or member.lost or member.drawn is None or member.place is None:
-            return False
-        shown = tracker.screen.sample(frame.masks) >= 128
-        for camera, cells, body in zip(self._setup.rig, shown, member.drawn, strict=True):
-            area = np.count_nonzero(body)
-            if np.count_nonzero(cells) <= (1 + UNKNOWN) * area:
-                continue
-            reach = _ALONE_M * camera.pixels_per_metre(member.place) / tracker.screen.step
-            size = 2 * max(round(reach), 1) + 1
-            near = cv2.dilate(body.view(np.uint8), np.ones((size, size), np.uint8)) > 0
-            if np.count_nonzero(cells & ~near) > UNKNOWN * area:
-                return True
-        return False
-
     def _step_all(self, frame: Observation) -> tuple[dict[int, Tracked], PixelOwners]:
         """Return the answers of all members, and the owners of the pixels at the poses that were expected."""
         owners = self._owners(frame, ahead=True)
         answers = {
-            member.number: self._step(member, owners.share(frame, k, member.lost and not member.absent))
+            member.number: member.step(owners.share(frame, k, member.lost and not member.absent))
             for k, member in enumerate(self._tracked)
         }
         return answers, owners
@@ -335,15 +287,8 @@ class People:
         """Return the owners of a frame's pixels, in the order of the members, by their bodies at the last pose, or at
         the pose expected in the next frame if ``ahead``."""
         assert self._grid is not None
-        bodies: list[RenderedBody | None] = [None if m.lost else _sharing(m).rendered(ahead) for m in self._tracked]
+        bodies: list[RenderedBody | None] = [None if m.lost else m.sharing.rendered(ahead) for m in self._tracked]
         return assign(self._setup.rig, self._grid, bodies, frame)
-
-    def _step(self, member: Member, share: Observation) -> Tracked:
-        estimate, used = member.monitor.step(share)
-        member.lost = estimate.status == "lost"
-        if not member.lost:
-            member.drawn, member.place = estimate.drawn, estimate.joints.mean(axis=0)
-        return Tracked(estimate, share, used)
 
     def _judge(self, answers: Mapping[int, Tracked]) -> None:
         """Compare people whose contact has ended with those before it; exchange their trackers if they were mixed
@@ -353,20 +298,20 @@ class People:
             return
         pelvis = {n: answers[n].estimate.joints[JOINTS.index("pelvis")] for n in here}
         frame = next(iter(answers.values())).share.index
-        for contact in self._contacts.update(frame, pelvis, {n: _sharing(m).learned() for n, m in here.items()}):
+        for contact in self._contacts.update(frame, pelvis, {n: m.sharing.learned() for n, m in here.items()}):
             pair = [here[number] for number in contact.people]
             likeness = np.zeros((2, 2))
             for i, one in enumerate(pair):
                 for j, other in enumerate(pair):
-                    share, pose = answers[one.number].used, _sharing(one).last_poses()[0]
-                    likeness[i, j] = _sharing(other).likeness(share, contact.learned[j], pose)
+                    share, pose = answers[one.number].used, one.sharing.last_poses()[0]
+                    likeness[i, j] = other.sharing.likeness(share, contact.learned[j], pose)
             contact.outcome = outcome_of(likeness, contact.shorter_m)
             _LOG.debug("contact of %s, frames %d to %d: %s", contact.people, contact.first, contact.last, likeness)
             if contact.outcome == EXCHANGED:
-                states = [self._state_of(member) for member in pair]
+                states = [member.state() for member in pair]
                 for member, state, colors in zip(pair, states[::-1], contact.learned, strict=True):
-                    _sharing(member).rewind({**state, **colors})
-                    self._restore(member, state)
+                    member.sharing.rewind({**state, **colors})
+                    member.restore(state)
             contact.learned = ()
 
     # --- who enters and leaves ----------------------------------------------------------------------------------------
@@ -381,7 +326,7 @@ class People:
         owners = owners or self._owners(frame)
         found = self._newcomers(frame, owners)
         for member in lost:
-            if not found and self._gone(member, frame):
+            if not found and member.has_left(frame.masks):
                 member.absent = True
             elif found and self._choice != "all":
                 member.absent = False  # no newcomer is written: who appears may be this person, and the tracker looks
@@ -394,7 +339,7 @@ class People:
         for person in found:
             shares = self._shares([person], list(self._unknown)[::-1])[0]
             away = [m for m in self._tracked if m.absent]
-            alike = [_sharing(m).likeness(replace(shares[0], images=frame.images)) for m in away]
+            alike = [m.sharing.likeness(replace(shares[0], images=frame.images)) for m in away]
             if alike and max(alike) > _SAME_COLORS:
                 away[int(np.argmax(alike))].absent = False  # the tracker finds this person in the unknown pixels
                 continue
@@ -450,18 +395,6 @@ class People:
             residual=np.full((views, 2), np.nan) if tracker.reports_sigma else None,
         )
 
-    def _gone(self, member: Member, frame: Observation) -> bool:
-        """Return whether a lost person has left the last place: in every view most of the body would be on background.
-
-        One view that still shows the person says that the others' masks fail.
-        """
-        body = member.drawn
-        if body is None:
-            return False
-        masks = _sharing(member).screen.sample(frame.masks)
-        covered = np.count_nonzero(body, axis=(1, 2))
-        return bool((np.count_nonzero(body & (masks < 128), axis=(1, 2)) >= 0.5 * covered).all())
-
     # --- what a result keeps ------------------------------------------------------------------------------------------
 
     def report(self) -> list[str]:
@@ -475,7 +408,9 @@ class People:
         state: dict[str, Any] = {}
         for k, member in enumerate(self._tracked):
             prefix = f"{_PEOPLE}{k}/" if k else ""
-            state |= {prefix + name: value for name, value in self._state_of(member).items()}
+            number = next((k for k, known in enumerate(self._setup.subjects) if known is member.subject), -1)
+            own = {**member.state(), _SUBJECT: number, _IN_INIT_POSE: member.subject.in_init_pose}
+            state |= {prefix + name: value for name, value in own.items()}
             if not member.written:
                 state |= {f"{prefix}{_MODEL}{name}": value for name, value in member.tracker.model().items()}
         return state | {_CONTACTS + name: value for name, value in self._contacts.state().items()}
@@ -497,30 +432,6 @@ class People:
             member = self._member(k, known, tracker, written=k < len(models))
             self._tracked[k:] = [member]
             tracker.restore(models[k] if member.written else below(_MODEL, own), own)
-            self._restore(member, own)
+            member.restore(own)
             k += 1
         self._contacts.restore(below(_CONTACTS, state))
-
-    def _state_of(self, member: Member) -> dict[str, Any]:
-        watch = {_WATCH + name: value for name, value in member.monitor.state().items()}
-        drawn = {} if member.drawn is None else {_DRAWN: member.drawn, _PLACE: member.place}
-        number = next((k for k, known in enumerate(self._setup.subjects) if known is member.subject), -1)
-        known = {_SUBJECT: number, _IN_INIT_POSE: member.subject.in_init_pose}
-        return {**member.tracker.state(), **watch, **drawn, **known, _LOST: member.lost, _ABSENT: member.absent}
-
-    def _restore(self, member: Member, state: Mapping[str, Any]) -> None:
-        member.monitor.restore(below(_WATCH, state))
-        member.lost, member.absent = bool(state[_LOST]), bool(state[_ABSENT])
-        member.drawn = np.array(state[_DRAWN], np.bool_) if _DRAWN in state else None
-        member.place = np.array(state[_PLACE], np.float64) if _PLACE in state else None
-
-
-def below(prefix: str, state: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of a state whose names begin with a prefix, without it."""
-    return {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}
-
-
-def _sharing(member: Member) -> SharingTracker:
-    tracker = sharing(member.tracker)
-    assert tracker is not None
-    return tracker

@@ -1,0 +1,113 @@
+"""A person who is tracked: the tracker, its camera monitor, and where the person was last."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.model.cameras.camera import Rig
+from tk.model.setup import Subject
+from tk.trackers.camera_monitor import CameraMonitor
+from tk.trackers.protocol import Estimate, Observation, SharingTracker, Tracker, sharing
+from tk.trackers.sharing import UNKNOWN
+
+Float = NDArray[np.float64]
+
+# Pixels farther from the body of a person who is alone than this, metres, may show somebody else: more than half a
+# frame's motion of a fist.
+_ALONE_M = 0.25
+
+_DRAWN, _PLACE = "drawn", "place"
+_WATCH, _LOST, _ABSENT = "watch/", "lost", "absent"
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A member's answer for a frame: the estimate, the member's share of the frame, and what its tracker used."""
+
+    estimate: Estimate
+    share: Observation
+    used: Observation
+
+
+@dataclass
+class Member:
+    """A person who is tracked."""
+
+    number: int  # in the result; people who are not written have higher numbers
+    subject: Subject  # what is known of the person
+    tracker: Tracker
+    monitor: CameraMonitor
+    written: bool = True  # whether the person is in the result
+    lost: bool = False  # in the last frame
+    absent: bool = False  # nobody was seen in the last frame who could be this person
+    drawn: NDArray[np.bool_] | None = None  # (C, h, w) the body in the last frame that is not lost, see `Estimate`
+    place: Float | None = None  # (3,) m, mean of the joints in that frame
+
+    @property
+    def sharing(self) -> SharingTracker:
+        """The tracker, which can track a person among others."""
+        tracker = sharing(self.tracker)
+        assert tracker is not None
+        return tracker
+
+    def step(self, share: Observation) -> Tracked:
+        """Return the answer for this person's share of the next frame."""
+        estimate, used = self.monitor.step(share)
+        self.lost = estimate.status == "lost"
+        if not self.lost:
+            self.drawn, self.place = estimate.drawn, estimate.joints.mean(axis=0)
+        return Tracked(estimate, share, used)
+
+    def shows_others(self, masks: NDArray[np.uint8], rig: Rig) -> bool:
+        """Return whether masks (C, H, W) show more than this person: pixels far from the last body."""
+        tracker = sharing(self.tracker)
+        if tracker is None or self.lost or self.drawn is None or self.place is None:
+            return False
+        shown = tracker.screen.sample(masks) >= 128
+        for camera, cells, body in zip(rig, shown, self.drawn, strict=True):
+            area = np.count_nonzero(body)
+            if np.count_nonzero(cells) <= (1 + UNKNOWN) * area:
+                continue
+            reach = _ALONE_M * camera.pixels_per_metre(self.place) / tracker.screen.step
+            size = 2 * max(round(reach), 1) + 1
+            near = cv2.dilate(body.view(np.uint8), np.ones((size, size), np.uint8)) > 0
+            if np.count_nonzero(cells & ~near) > UNKNOWN * area:
+                return True
+        return False
+
+    def has_left(self, masks: NDArray[np.uint8]) -> bool:
+        """Return whether the person, who is lost, has left the last place: in every view most of the body would be on
+        background, by masks (C, H, W).
+
+        One view that still shows the person says that the others' masks fail.
+        """
+        body = self.drawn
+        if body is None:
+            return False
+        sampled = self.sharing.screen.sample(masks)
+        covered = np.count_nonzero(body, axis=(1, 2))
+        return bool((np.count_nonzero(body & (sampled < 128), axis=(1, 2)) >= 0.5 * covered).all())
+
+    def state(self) -> dict[str, Any]:
+        """Return what :meth:`restore`, and that of the tracker, need."""
+        watch = {_WATCH + name: value for name, value in self.monitor.state().items()}
+        drawn = {} if self.drawn is None else {_DRAWN: self.drawn, _PLACE: self.place}
+        return {**self.tracker.state(), **watch, **drawn, _LOST: self.lost, _ABSENT: self.absent}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state; the caller restores the tracker."""
+        self.monitor.restore(below(_WATCH, state))
+        self.lost, self.absent = bool(state[_LOST]), bool(state[_ABSENT])
+        self.drawn = np.array(state[_DRAWN], np.bool_) if _DRAWN in state else None
+        self.place = np.array(state[_PLACE], np.float64) if _PLACE in state else None
+
+
+def below(prefix: str, state: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of a state whose names begin with a prefix, without it."""
+    return {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}
