@@ -2,9 +2,8 @@
 
 People are found by their visual hulls, in the first frame in which somebody stands in the working volume. Everybody
 there gets a tracker, also people who are not written, because a body separates their pixels from those of others
-(:mod:`tk.trackers.sharing`). Pixels
-that no body explains show somebody unknown. They are no evidence for the people who are tracked. A person who enters is
-found in them.
+(:mod:`tk.trackers.sharing`). Pixels that no body explains show somebody unknown. They are no evidence for the people
+who are tracked. A person who enters is found in them.
 
 A person who is alone in view gets the whole masks.
 """
@@ -79,7 +78,6 @@ class People:
         self._admit_from = 0  # the frame from which on another may be
         #: why nobody is tracked yet; empty before the first frame
         self.refusal = ""
-        self._known_finder: PeopleFinder | None = None
         share = sharing(first)
         self._grid: RayGrid | None = None if share is None else share.choice
 
@@ -212,11 +210,9 @@ class People:
         member.tracker.start(seen, replace(member.subject, hull_m=hull_m))
         member.monitor.check_body()
 
-    @property
+    @cached_property
     def _finder(self) -> PeopleFinder:
-        if self._known_finder is None:
-            self._known_finder = PeopleFinder(self._setup.rig, self._setup.volume, self._setup.up)
-        return self._known_finder
+        return PeopleFinder(self._setup.rig, self._setup.volume, self._setup.up)
 
     def _several_in(self, opening: Sequence[Observation]) -> bool:
         """Return whether several people are found in some frame of the opening."""
