@@ -242,7 +242,7 @@ def test_person_whose_size_contradicts_the_given_height_is_refused(scene: Scene)
 class Jumping:
     """A tracker whose estimate jumps in one frame."""
 
-    can_exclude_cameras = False
+    can_exclude_cameras = tracks_among_others = False
 
     def __init__(self, joints: np.ndarray, when: int) -> None:
         self.joints, self.when = joints, when

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
@@ -265,6 +265,23 @@ def sharing(tracker: Tracker) -> SharingTracker | None:
 def shows_person(masks: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Return (C,) whether each mask (C, H, W) shows the subject."""
     return np.asarray(masks.reshape(len(masks), -1).max(axis=1) >= 128)
+
+
+def without_cameras(frame: Observation, out: NDArray[np.bool_]) -> Observation:
+    """Return the frame with empty masks in some cameras (C,)."""
+    if not out.any():
+        return frame
+    masks = frame.masks.copy()
+    masks[out] = 0
+    uncertain = frame.uncertain
+    if uncertain is not None:
+        uncertain = uncertain.copy()
+        uncertain[out] = False
+    images = frame.images
+    if images.size:  # a single colour has no edges
+        images = images.copy()
+        images[out] = 0
+    return replace(frame, images=images, masks=masks, uncertain=uncertain)
 
 
 class Stopwatch:
