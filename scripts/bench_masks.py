@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from tk.io.captures.capture import Capture, open_capture
-from tk.io.captures.clip import MASK_THRESHOLD
+from tk.kernels.mask_values import PERSON
 from tk.run.segmentation import make_labeller
 from tk.run.task import Task
 from tk.settings import Settings
@@ -43,7 +43,7 @@ def truth_of(folder: Path, capture: Capture, index: int) -> np.ndarray:
     result = np.zeros((len(capture.clips), *capture.rig.frame_shape), bool)
     for out, clip in zip(result, capture.clips, strict=True):
         mask = cv2.imread(str(folder / clip.path.stem / f"{index:06d}.png"), cv2.IMREAD_GRAYSCALE)
-        out[: mask.shape[0], : mask.shape[1]] = mask >= MASK_THRESHOLD
+        out[: mask.shape[0], : mask.shape[1]] = mask >= PERSON
     return result
 
 

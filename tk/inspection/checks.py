@@ -21,6 +21,7 @@ from tk.evaluation.joints import plain_values
 from tk.inspection.leveling import Leveling, find_up
 from tk.inspection.people import PeopleWatch, PersonReport, many_people
 from tk.io.captures.capture import Capture
+from tk.kernels.mask_values import PERSON
 from tk.model.body.plausibility import fits_height
 from tk.model.cameras.common_view import sample_box, views_of
 from tk.model.cameras.up import up_vector
@@ -365,7 +366,7 @@ def _camera(
     capture: Capture, masks: Sequence[Masks], c: int, agreement: Agreement, late: int, bad_images: int
 ) -> CameraReport:
     camera = capture.rig[c]
-    own = [m[c, : camera.height, : camera.width] >= 128 for m in masks]
+    own = [m[c, : camera.height, : camera.width] >= PERSON for m in masks]
     shown = [m for m in own if m.any()]
     specks, holes, cut = [], [], 0
     for mask in shown:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError
 from tk.inspection.checks import Inspection, Sample
 from tk.io.captures.capture import Capture
+from tk.kernels.mask_values import PERSON
 from tk.model.cameras.camera import Camera
 from tk.model.cameras.up import up_vector
 from tk.render.canvas import text_width, write, write_png
@@ -91,7 +92,7 @@ def _columns(image: Image, line: str, y: int, color: tuple[int, int, int]) -> No
 def _tile(capture: Capture, inspection: Inspection, frame: Sample, c: int) -> Image:
     camera = capture.rig[c]
     picture = frame.images[c, : camera.height, : camera.width].copy()
-    mask = (frame.masks[c, : camera.height, : camera.width] >= 128).astype(np.uint8)
+    mask = (frame.masks[c, : camera.height, : camera.width] >= PERSON).astype(np.uint8)
     thick = max(1, round(camera.height / 240))
     if frame.hulls is not None:
         hull = np.repeat(np.repeat(frame.hulls[c].astype(np.uint8), frame.step, 0), frame.step, 1)

@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.kernels.mask_values import PERSON
 from tk.model.body.plausibility import EXTENT, STATURE_M
 from tk.model.body.skeleton import up_rotation
 from tk.model.cameras.camera import Rig
@@ -228,7 +229,7 @@ class PeopleFinder:
         small = masks[:, offset :: self._step, offset :: self._step].reshape(len(masks), -1)
         _, voxels = self._table.voxels(near)
         values, sees = np.take_along_axis(small, voxels.pixels, axis=1), voxels.sees
-        empty, shown = (values == 0) & sees, ((values >= 128) & sees).sum(axis=0) >= 2
+        empty, shown = (values == 0) & sees, ((values >= PERSON) & sees).sum(axis=0) >= 2
         contradictions = empty.sum(axis=0)
         hull = shown & (contradictions == 0)
         if 2 * np.count_nonzero(hull) < count:

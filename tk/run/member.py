@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.kernels.mask_values import PERSON
 from tk.model.cameras.camera import Rig
 from tk.model.setup import Subject
 from tk.trackers.camera_monitor import CameraMonitor
@@ -69,7 +70,7 @@ class Member:
         tracker = sharing(self.tracker)
         if tracker is None or self.lost or self.drawn is None or self.place is None:
             return False
-        shown = tracker.screen.sample(masks) >= 128
+        shown = tracker.screen.sample(masks) >= PERSON
         for camera, cells, body in zip(rig, shown, self.drawn, strict=True):
             area = np.count_nonzero(body)
             if np.count_nonzero(cells) <= (1 + UNKNOWN) * area:
@@ -92,7 +93,7 @@ class Member:
             return False
         sampled = self.sharing.screen.sample(masks)
         covered = np.count_nonzero(body, axis=(1, 2))
-        return bool((np.count_nonzero(body & (sampled < 128), axis=(1, 2)) >= 0.5 * covered).all())
+        return bool((np.count_nonzero(body & (sampled < PERSON), axis=(1, 2)) >= 0.5 * covered).all())
 
     def state(self) -> dict[str, Any]:
         """Return what :meth:`restore`, and that of the tracker, need."""

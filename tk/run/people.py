@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from tk.errors import CaptureError, ConfigError
-from tk.kernels.mask_values import OTHERS
+from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.body.skeleton import JOINTS
 from tk.model.cues.part_colors import RenderedBody
 from tk.model.cues.ray_costs import RayGrid
@@ -352,7 +352,7 @@ class People:
         if np.count_nonzero(unexplained > _UNEXPLAINED * person) < 2:
             return []
         masks = owners.unknown(frame).masks
-        return [p for p in self._finder.find(masks >= 128, hidden=masks == OTHERS) if p.inside]
+        return [p for p in self._finder.find(masks >= PERSON, hidden=masks == OTHERS) if p.inside]
 
     def _admit(
         self, frames: Sequence[Observation], person: LocatedPerson, subject: Subject, written: bool

@@ -16,7 +16,7 @@ from tk.io.captures.capture import Capture
 from tk.io.captures.mask_store import MaskStore
 from tk.io.paths import check_output
 from tk.io.results.reader import read_result
-from tk.kernels.mask_values import OTHERS
+from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.agreement import LATE_FRAMES, CameraAgreement, camera_agreement
 from tk.model.cameras.bundle import TrackedPoses, choose_frames
@@ -263,7 +263,7 @@ def whole_delays(
     def wrong(n: int) -> Float:
         """Return (R, C) the shares of wrong pixels with masks of n frames before; NaN where they show nobody."""
         both = zip(bodies, (sampled(int(frames[i]) - n) for i in rows), strict=True)
-        return np.array([residual_of(drawn, m >= 128, m == OTHERS).sum(axis=1) for drawn, m in both])
+        return np.array([residual_of(drawn, m >= PERSON, m == OTHERS).sum(axis=1) for drawn, m in both])
 
     # frames in which a camera shows somebody with every delay
     shares = np.array([wrong(n) for n in shifts])

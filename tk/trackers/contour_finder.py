@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError
 from tk.kernels.line_search import SearchSettings
+from tk.kernels.mask_values import PERSON
 from tk.kernels.silhouette import descend, normal_equations
 from tk.model.body.anthropometry import AVERAGE_BODY, BodyDimensions
 from tk.model.body.body_fit import INFORMATIVE_FRAMES, STATURE_DEVIATION, fit_body
@@ -177,7 +178,7 @@ class ContourFinder:
         """Use at most :data:`OPENING_CAMERAS` inside, those from the most different sides; yield their share."""
         rig = self.world.rig
         # a camera that sees nobody in the first frame is no use for the search
-        seeing = np.flatnonzero((pyramids[0].masks[0] >= 128).any(axis=(1, 2)))
+        seeing = np.flatnonzero((pyramids[0].masks[0] >= PERSON).any(axis=(1, 2)))
         if len(seeing) <= OPENING_CAMERAS:
             yield frames, pyramids
             return

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
+from tk.kernels.mask_values import PERSON
 from tk.model.body import gait_poses as gait
 from tk.model.body.stored_body import restore_body
 from tk.model.cues.part_colors import PartColors, RenderedBody, color_bins
@@ -113,7 +114,7 @@ class ContourTracker(ContourFinder, ABC):
         by_color = 0.0
         if frame.images.size:
             bins = color_bins(self.choice.sample(frame.images))
-            by_color = colors.likeness(bins[self.choice.sample(frame.masks) >= 128])
+            by_color = colors.likeness(bins[self.choice.sample(frame.masks) >= PERSON])
         if pose is None:
             return by_color
         pyramid = self.pyramid(frame)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
+from tk.kernels.mask_values import PERSON
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import AVERAGE_BODY
 from tk.model.body.cone_body import ConeBody, build_cone_body
@@ -262,7 +263,7 @@ def centroid(rig: Rig, pyramid: Pyramid, index: int) -> Float:
         CaptureError: fewer than two cameras see anybody.
     """
     A, y, count = np.zeros((3, 3)), np.zeros(3), 0
-    shown = [np.nonzero(mask >= 128) for mask in pyramid.masks[0]]
+    shown = [np.nonzero(mask >= PERSON) for mask in pyramid.masks[0]]
     least = WHOLE * max(len(ys) for ys, _ in shown)
     for (ys, xs), camera in zip(shown, rig, strict=True):
         if len(ys) <= least:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.kernels.mask_values import PERSON
+
 if TYPE_CHECKING:  # the process that decodes and segments needs no parts of a tracker
     from tk.model.body.cone_body import ConeBody
     from tk.model.cameras.camera import Rig
@@ -264,7 +266,7 @@ def sharing(tracker: Tracker) -> SharingTracker | None:
 
 def shows_person(masks: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Return (C,) whether each mask (C, H, W) shows the subject."""
-    return np.asarray(masks.reshape(len(masks), -1).max(axis=1) >= 128)
+    return np.asarray(masks.reshape(len(masks), -1).max(axis=1) >= PERSON)
 
 
 def without_cameras(frame: Observation, out: NDArray[np.bool_]) -> Observation:

@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.kernels.mask_values import PERSON
 from tk.kernels.silhouette import normal_equations
 from tk.model.body.joint_sigma import VIEW_M, contour_variance, directions, posture_variance, view_variance
 from tk.model.body.limb_candidates import Limb
@@ -218,7 +219,7 @@ class RegionTracker(ContourTracker):
         if not (self.config.colors and self.colors.known and frame.images.size):
             return frame
         foreign, grid = self.colors.foreign, self.screen
-        person = grid.sample(frame.masks) >= 128
+        person = grid.sample(frame.masks) >= PERSON
         unknown = foreign[color_bins(grid.sample(frame.images)[person])]
         view = np.nonzero(person)[0]
         seen, odd = (np.bincount(of, minlength=len(person)) for of in (view, view[unknown]))
@@ -232,14 +233,14 @@ class RegionTracker(ContourTracker):
                 for rays in (np.flatnonzero(person[c].any(axis=axis)) for axis in (1, 0))
             )
             # a quarter of the pixels shows objects of this size
-            odd_pixels = foreign[color_bins(frame.images[c][box][::2, ::2])] & (masks[c][box][::2, ::2] >= 128)
+            odd_pixels = foreign[color_bins(frame.images[c][box][::2, ::2])] & (masks[c][box][::2, ::2] >= PERSON)
             opened = np.asarray(cv2.morphologyEx(odd_pixels.view(np.uint8), cv2.MORPH_OPEN, SQUARE3), np.uint8)
             if not opened.any():
                 continue
             if masks is frame.masks:  # the frame's own stay as they are
                 masks = masks.copy()
                 uncertain = np.zeros(masks.shape, np.bool_) if frame.uncertain is None else frame.uncertain.copy()
-            shown = masks[c][box] >= 128
+            shown = masks[c][box] >= PERSON
             carried = doubled(opened)[: len(shown), : shown.shape[1]].view(np.bool_) & shown
             masks[c][box][carried] = 0
             uncertain[c][box][carried] = True

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.mask_values import OTHERS
+from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import LEAST_INFORMATION, depth_information
 from tk.model.cues.ray_costs import residual_of
@@ -152,7 +152,7 @@ class ResidualJudge:
             masks = masks.copy()
             masks[~used] = tracker.cleaned(frame.masks[~used])
         sampled = tracker.screen.sample(masks)
-        person, others = sampled >= 128, sampled == OTHERS
+        person, others = sampled >= PERSON, sampled == OTHERS
         residual = residual_of(drawn, person, others)
         if frame.uncertain is not None:
             excused = residual_of(drawn & tracker.screen.sample(frame.uncertain), person, others)[:, 0]

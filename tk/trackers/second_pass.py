@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.mask_values import OTHERS
+from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.body.body_fit import STATURE_DEVIATION
 from tk.model.body.joint_sigma import directions, posture_variance
 from tk.model.body.limb_candidates import Limb, exchanged
@@ -133,7 +133,7 @@ class SecondPass:
             self.poses[chunk] = settled.states
             label = grid.render(tracker.body, settled.states).label
             sampled = grid.sample(seen.masks[0]).reshape(label.shape)
-            residual = residual_of(label > 0, sampled >= 128, sampled == OTHERS)
+            residual = residual_of(label > 0, sampled >= PERSON, sampled == OTHERS)
             self.residual[chunk] = residual
             self._variance[0, chunk] = tracker.variance(settled.states, settled.hessian, prior, label, residual)
             self._advance(len(chunk))

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.line_search import COLOR_BINS, MOST_LOG_RATIO
-from tk.kernels.mask_values import OTHERS
+from tk.kernels.mask_values import OTHERS, PERSON
 from tk.kernels.raycast import FAR
 from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import RenderedBody, color_bins
@@ -73,19 +73,19 @@ class PixelOwners:
         own = self.owner == person
         if unknown:
             own |= self.owner == NOBODY
-        masks[(masks >= 128) & ~own] = OTHERS
+        masks[(masks >= PERSON) & ~own] = OTHERS
         return replace(frame, masks=masks)
 
     def unknown(self, frame: Observation) -> Observation:
         """Return the observation of people who are unknown; pixels of known people are
         :data:`~tk.kernels.mask_values.OTHERS`."""
         masks = frame.masks.copy()
-        masks[(masks >= 128) & (self.owner != NOBODY)] = OTHERS
+        masks[(masks >= PERSON) & (self.owner != NOBODY)] = OTHERS
         return replace(frame, masks=masks)
 
     def areas(self, masks: NDArray[np.uint8]) -> NDArray[np.int64]:
         """Return (K + 1, V) the number of cells of each person in masks (V, H, W), last those of unknown people."""
-        shown, owner = self.grid.sample(masks) >= 128, self.grid.sample(self.owner)
+        shown, owner = self.grid.sample(masks) >= PERSON, self.grid.sample(self.owner)
         people = (*range(self.people), NOBODY)
         return np.array([np.count_nonzero(shown & (owner == k), axis=(1, 2)) for k in people])
 
@@ -128,7 +128,7 @@ def assign(
         frame: images and masks. Pixels with values below 128 have no owner.
         unknown: see :data:`UNKNOWN`.
     """
-    shown = grid.sample(frame.masks) >= 128
+    shown = grid.sample(frame.masks) >= PERSON
     owner = np.full(frame.masks.shape, NOBODY, np.int8)
     areas = [np.count_nonzero(body.label, axis=(1, 2)) for body in bodies if body is not None]
     least = unknown * float(np.median(areas)) if areas else 0.0
@@ -146,7 +146,7 @@ def assign(
         view = _View(grid.step, shown[v][cells], [*shapes, *stranger])
         pixels = _pixels(cells, grid.step)
         image = frame.images[v][pixels] if frame.images.size else None
-        owner[v][pixels] = view.owners(frame.masks[v][pixels] >= 128, image)
+        owner[v][pixels] = view.owners(frame.masks[v][pixels] >= PERSON, image)
     return PixelOwners(grid, owner, len(bodies))
 
 

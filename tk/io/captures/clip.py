@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import VideoError
+from tk.kernels.mask_values import PERSON
 
 # OpenCV and FFmpeg write nothing to the terminal, unless the user sets these variables: errors here name the file.
 # FFmpeg's level is read when the first video is opened; -8 is its AV_LOG_QUIET. OpenCV reads its own on import.
@@ -21,9 +22,6 @@ if "OPENCV_LOG_LEVEL" not in os.environ:
     (getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel)(0)  # OpenCV 4, OpenCV 5
 
 Image = NDArray[np.uint8]
-
-#: least grey value of the foreground in a mask: half of 255, because video coding blurs edges
-MASK_THRESHOLD = 128
 
 
 class Reader(Protocol):
@@ -100,4 +98,4 @@ def check_size(clip: Clip, width: int, height: int, path: Path) -> None:
 
 
 def _binarised(grey: NDArray[Any]) -> Image:
-    return np.asarray(cv2.threshold(grey, MASK_THRESHOLD - 1, 255, cv2.THRESH_BINARY)[1], np.uint8)
+    return np.asarray(cv2.threshold(grey, PERSON - 1, 255, cv2.THRESH_BINARY)[1], np.uint8)

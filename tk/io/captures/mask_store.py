@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import FULL, DiskFullError, TkError
-from tk.kernels.mask_values import OTHERS
+from tk.kernels.mask_values import OTHERS, PERSON
 
 Masks = NDArray[np.uint8]
 
@@ -92,7 +92,7 @@ class MaskStore:
         crops = [mask[y : y + h, x : x + w] for mask, (x, y, w, h) in zip(masks, boxes, strict=True)]
         if any((crop == OTHERS).any() for crop in crops):  # first: a frame whose masks are in the file is whole
             self._put(~index, masks.shape, boxes, [crop == OTHERS for crop in crops])
-        self._put(index, masks.shape, boxes, [crop >= 128 for crop in crops])
+        self._put(index, masks.shape, boxes, [crop >= PERSON for crop in crops])
 
     def _put(
         self, index: int, shape: tuple[int, ...], boxes: NDArray[np.int32], crops: Sequence[NDArray[np.bool_]]

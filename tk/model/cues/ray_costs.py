@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.mask_values import OTHERS
+from tk.kernels.mask_values import OTHERS, PERSON
 from tk.kernels.projection import pack_cameras
 from tk.kernels.raycast import Cast, Rays, cast, costs
 from tk.model.body.cone_body import COLOR_GROUPS, ConeBody
@@ -100,7 +100,7 @@ class Evidence:
     ) -> Evidence:
         """Return the costs from masks (V, H, W), uncertain pixels, images, and the learned colours of the parts."""
         sampled = grid.sample(masks)
-        person, others = sampled >= 128, sampled == OTHERS
+        person, others = sampled >= PERSON, sampled == OTHERS
         outside = np.ones(person.shape, np.float32)
         if uncertain is not None:
             outside[grid.sample(uncertain)] = UNCERTAIN_COST

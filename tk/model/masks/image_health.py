@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.kernels.mask_values import PERSON
+
 # Rows of an image that are compared, approximately.
 _ROWS = 64
 # An image is blank if the standard deviation of its grey levels is below this: above the sensor's noise. The least of
@@ -60,7 +62,7 @@ class ImageHealth:
         """
         C = len(masks)
         step = max(1, masks.shape[1] // _ROWS)
-        small = masks[:, step // 2 :: step, step // 2 :: step] >= 128
+        small = masks[:, step // 2 :: step, step // 2 :: step] >= PERSON
         given = images.size > 0
         # the green channel suffices
         shown = images[:, step // 2 :: step, step // 2 :: step, 1].copy() if given else small * np.uint8(255)
@@ -103,7 +105,7 @@ def sampled(images: NDArray[np.uint8], masks: NDArray[np.uint8]) -> Sampled:
     """Return what :func:`contradiction` needs of a frame: images (C, H, W, 3) and masks (C, H, W)."""
     step = max(1, masks.shape[1] // _ROWS)
     grid = np.s_[:, step // 2 :: step, step // 2 :: step]
-    return images[grid].astype(np.int16), masks[grid] >= 128
+    return images[grid].astype(np.int16), masks[grid] >= PERSON
 
 
 def contradiction(pairs: Iterable[tuple[Sampled, Sampled]]) -> str | None:

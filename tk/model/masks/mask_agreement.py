@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.mask_values import OTHERS
+from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import LEAST_INFORMATION, depth_information
 from tk.model.cameras.volume import Volume, VoxelGrid
@@ -143,7 +143,7 @@ class MaskAgreement:
     def small(self, masks: Masks) -> Bool:
         """Return (C, h, w) every ``step``-th pixel of masks (C, H, W)."""
         offset = self.step // 2
-        return np.asarray(masks[:, offset :: self.step, offset :: self.step] >= 128)
+        return np.asarray(masks[:, offset :: self.step, offset :: self.step] >= PERSON)
 
     def possible(self, masks: Masks) -> Bool:
         """Return (C, h, w) the same, with the pixels where others may hide the person."""
@@ -331,7 +331,7 @@ class MaskAgreement:
 def _outline(camera: Camera, mask: Masks) -> Outline | None:
     """Return the outline of a mask (H, W); None if it is empty, or if another person may hide a part of it."""
     others = (mask == OTHERS).astype(np.uint8)
-    if others.any() and (dilated(others, 1) & (mask >= 128)).any():
+    if others.any() and (dilated(others, 1) & (mask >= PERSON)).any():
         return None
     return Outline.of(camera, mask)
 

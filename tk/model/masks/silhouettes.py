@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.mask_values import OTHERS
+from tk.kernels.mask_values import OTHERS, PERSON
 from tk.kernels.projection import pack_cameras
 from tk.kernels.silhouette import Silhouettes
 from tk.model.cameras.camera import Rig
@@ -27,7 +27,7 @@ SPECK_SHARE, HOLE_SHARE = 0.05, 0.004
 
 def clean(mask: Masks) -> Masks:
     """Return a mask (H, W) without specks and small holes, 0 or 255."""
-    return clean_by_area(mask >= 128, SPECK_SHARE, HOLE_SHARE, relative=True)
+    return clean_by_area(mask >= PERSON, SPECK_SHARE, HOLE_SHARE, relative=True)
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Views:
                 if (part := mask[crop]).size:
                     out[crop] = kept = clean(part)
                     if shared:  # a region that others cut off may be small: it is no evidence, not background
-                        out[crop][(part == OTHERS) | ((part >= 128) & (kept == 0))] = OTHERS
+                        out[crop][(part == OTHERS) | ((part >= PERSON) & (kept == 0))] = OTHERS
             masks = cleaned
         V, H, W = masks.shape
         levels = [masks, *(np.zeros((V, -(-H // 2**k), -(-W // 2**k)), np.uint8) for k in range(1, scales))]
@@ -116,7 +116,7 @@ def _halved(part: Masks) -> Masks:
 
 def share_wrong(drawn: Masks, seen: Masks) -> Float:
     """Return E_S (V,) (eq. 12) of silhouettes (V, H, W) against masks (V, H, W), S_T; inf where the mask is empty."""
-    wrong = np.count_nonzero((drawn >= 128) != (seen >= 128), axis=(1, 2))
-    total = np.count_nonzero(seen >= 128, axis=(1, 2))
+    wrong = np.count_nonzero((drawn >= PERSON) != (seen >= PERSON), axis=(1, 2))
+    total = np.count_nonzero(seen >= PERSON, axis=(1, 2))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(total > 0, wrong / total, np.inf)

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.kernels.mask_values import PERSON
 from tk.model.cameras.camera import Camera
 
 Float = NDArray[np.float64]
@@ -58,7 +59,7 @@ class Outline:
     @staticmethod
     def of(camera: Camera, mask: Masks) -> Outline | None:
         """Return the outline in a mask (H, W), which may be larger than the image; None if it shows nobody."""
-        shown = np.ascontiguousarray(mask[: camera.height, : camera.width] >= 128).view(np.uint8)
+        shown = np.ascontiguousarray(mask[: camera.height, : camera.width] >= PERSON).view(np.uint8)
         contours, _ = cv2.findContours(shown, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
         areas = [cv2.contourArea(contour) for contour in contours]
         largest = max(areas, default=0.0)
