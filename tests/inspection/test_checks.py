@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from scripts.synthetic.capture import write_calibration
 from tests.conftest import Tk
-from tests.io.conftest import write_picture
+from tests.io.conftest import write_picture, write_video
 from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tk.errors import CaptureError
@@ -89,6 +89,16 @@ def test_inspect_and_track_refuse_masks_of_other_frames(tk: Tk, copy: Path, tmp_
     ran = tk("inspect", copy, "--json")
     assert expected in json.loads(ran.out)["findings"][0]
     tk("track", copy, "-o", tmp_path / "r.h5").complaint(str(copy), expected)
+
+
+def test_camera_that_was_moved_after_its_empty_scene_is_named(tk: Tk, copy: Path) -> None:
+    background = open_capture(copy).background()
+    assert background is not None
+    (clip,) = (copy / "background").glob("cam2*")
+    clip.unlink()
+    write_video(clip.with_suffix(".avi"), list(np.roll(background[1], 3, axis=2)))
+    (first, *_) = json.loads(tk("inspect", copy, "--json").out)["findings"]
+    assert first.startswith("camera cam2 was moved, by 3 px, between its empty scene and the recording")
 
 
 def test_delay_of_a_video_is_found_in_frames(tk: Tk, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ of these pixels.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -27,7 +27,8 @@ from tk.model.cameras.common_view import sample_box, views_of
 from tk.model.cameras.up import up_vector
 from tk.model.cameras.volume import Volume
 from tk.model.hull.coarse import Hull
-from tk.model.masks.image_health import ImageHealth, Sampled, contradiction, sampled
+from tk.model.masks.image_health import MOST_SHIFT, ImageHealth, Sampled, contradiction, sampled
+from tk.model.masks.image_shift import ImageShift
 from tk.model.masks.mask_agreement import INCONSISTENT, Agreement, MaskAgreement
 from tk.model.masks.regions import clean_by_area
 from tk.model.masks.silhouettes import HOLE_SHARE
@@ -67,7 +68,7 @@ class CameraReport:
         outside: share of its masks outside the hull of the other cameras.
         shift_px: smallest shift that moves its masks into that hull, pixels; NaN if none does.
         late_frames: frames by which its video starts late: its frame k shows what frame k + late of the others shows.
-        bad_images: number of frames whose image is blank or frozen.
+        bad_images: number of frames whose image is blank, frozen or moved.
         verdict: what is wrong, in words; empty if nothing is.
     """
 
@@ -217,8 +218,7 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
         capture=capture.name,
         frames=tuple(frames.tolist()),
         cameras=tuple(
-            _camera(capture, chosen, c, agreement, int(late[c]), int(read.bad_images[c]))
-            for c in range(len(capture.rig))
+            _camera(capture, chosen, c, agreement, int(late[c]), bad) for c, bad in enumerate(read.bad_images)
         ),
         with_hull=float(agreement.closes.mean()),
         extent_m=agreement.extent_m,
@@ -234,7 +234,8 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
         Sample(i, read.images[i], masks[i], _silhouettes(hulls[frames.tolist().index(i)], good), compare.step)
         for i in kept.tolist()
     ]
-    findings = [*_findings(inspection, capture, agreement), *many_people(people, entered)]
+    moved = [line for i in kept[:1] for line in _moved_since_empty(capture, read.images[int(i)], masks[int(i)])]
+    findings = [*moved, *_findings(inspection, capture, agreement), *many_people(people, entered)]
     return replace(inspection, findings=tuple([unrelated, *findings] if unrelated else findings)), seen
 
 
@@ -245,7 +246,7 @@ class _Read:
     Attributes:
         masks: (C, H, W) by frame index. images: (C, H, W, 3) likewise, of fewer frames. small: masks and images at a
             small size, of the frames of ``masks``.
-        bad_images: (C,) number of blank or frozen images.
+        bad_images: of each camera, what is wrong with an image, by frame index.
         watch: has seen the people.
         notes: what the capture and the segmentation report.
     """
@@ -253,7 +254,7 @@ class _Read:
     masks: dict[int, Masks]
     images: dict[int, NDArray[np.uint8]]
     small: dict[int, Sampled]
-    bad_images: NDArray[np.int64]
+    bad_images: tuple[dict[int, str], ...]
     watch: PeopleWatch
     notes: list[str]
 
@@ -263,7 +264,7 @@ def _read(capture: Capture, config: Settings, span: int, compared: set[int], kep
     images of those that are ``kept``."""
     notes = list(capture.warnings)
     label = make_labeller(Task.of(capture, config), notes.append)
-    read = _Read({}, {}, {}, np.zeros(len(capture.rig), np.int64), PeopleWatch(capture, span), notes)
+    read = _Read({}, {}, {}, tuple({} for _ in capture.rig), PeopleWatch(capture, span), notes)
     health = ImageHealth()
     with capture.frames(0, span) as reader:
         for frame in reader:
@@ -276,7 +277,9 @@ def _read(capture: Capture, config: Settings, span: int, compared: set[int], kep
             if i in compared:
                 read.masks[i] = labels.copy()
                 read.small[i] = sampled(frame.images, labels)
-                read.bad_images[:] += [reason is not None for reason in health.look(frame.images, read.masks[i])]
+                for bad, reason in zip(read.bad_images, health.look(frame.images, read.masks[i]), strict=True):
+                    if reason is not None:
+                        bad[i] = reason
             if i in kept:
                 read.images[i] = frame.images.copy()
     return read
@@ -363,7 +366,7 @@ def _silhouettes(hull: Hull | None, good: Sequence[int]) -> NDArray[np.bool_] | 
 
 
 def _camera(
-    capture: Capture, masks: Sequence[Masks], c: int, agreement: Agreement, late: int, bad_images: int
+    capture: Capture, masks: Sequence[Masks], c: int, agreement: Agreement, late: int, bad_images: Mapping[int, str]
 ) -> CameraReport:
     camera = capture.rig[c]
     own = [m[c, : camera.height, : camera.width] >= PERSON for m in masks]
@@ -378,7 +381,8 @@ def _camera(
         cut += bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
     verdict = ""
     if bad_images:
-        verdict = "its image is blank, or frozen while the others move"
+        first, reason = next(iter(bad_images.items()))
+        verdict = f"it {reason} (frame {first} is the first of {len(bad_images)})"
     elif late:
         verdict = (
             f"its video seems to start {_frames(late)}: its frame {max(-late, 0)} shows what frame "
@@ -396,9 +400,24 @@ def _camera(
         outside=float(agreement.outside[c]),
         shift_px=float(np.hypot(*agreement.shift_px[c])),
         late_frames=late,
-        bad_images=bad_images,
+        bad_images=len(bad_images),
         verdict=verdict,
     )
+
+
+def _moved_since_empty(capture: Capture, images: NDArray[np.uint8], masks: Masks) -> list[str]:
+    """Return a line for each camera whose image differs from that of its empty scene by a shift."""
+    lines = []
+    for camera, empty, image, mask in zip(capture.rig, capture.background() or (), images, masks, strict=False):
+        shift, (h, w) = ImageShift(), empty.shape[1:3]
+        shift.look(empty[:1], np.zeros((1, h, w), np.uint8))
+        moved = float(shift.look(image[None, :h, :w], mask[None, :h, :w])[0])
+        if moved > MOST_SHIFT:
+            lines.append(
+                f"camera {camera.name} was moved, by {moved * max(h, w):.0f} px, between its empty scene and the "
+                "recording: record the empty scene again, and calibrate again if that was done before the move"
+            )
+    return lines
 
 
 def _frames(late: int) -> str:

@@ -245,7 +245,7 @@ class Loop:
         return tuple(present)
 
     def _kept(self, answer: Tracked) -> NDArray[np.uint8]:
-        """Return the cleaned masks (C, H, W) of a frame, including those of excluded cameras, which may be refined."""
+        """Return the cleaned masks (C, H, W) of a frame, also of cameras that disagree: they may be refined."""
         tracker = two_pass(self.plan.tracker)
         assert tracker is not None
         taken = tracker.cleaned(answer.used.masks) if answer.estimate.masks is None else answer.estimate.masks

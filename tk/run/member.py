@@ -14,7 +14,7 @@ from tk.kernels.mask_values import PERSON
 from tk.model.cameras.camera import Rig
 from tk.model.setup import Subject
 from tk.trackers.camera_monitor import CameraMonitor
-from tk.trackers.protocol import Estimate, Observation, SharingTracker, Tracker, sharing
+from tk.trackers.protocol import Estimate, Observation, SharingTracker, Tracker, sharing, without_cameras
 from tk.trackers.sharing import UNKNOWN
 
 Float = NDArray[np.float64]
@@ -29,7 +29,8 @@ _WATCH, _LOST, _ABSENT = "watch/", "lost", "absent"
 
 @dataclass(frozen=True)
 class Tracked:
-    """A member's answer for a frame: the estimate, the member's share of the frame, and what its tracker used."""
+    """A member's answer for a frame: the estimate, the member's share of the frame in cameras whose images are right,
+    and what its tracker used."""
 
     estimate: Estimate
     share: Observation
@@ -63,7 +64,7 @@ class Member:
         self.lost = estimate.status == "lost"
         if not self.lost:
             self.drawn, self.place = estimate.drawn, estimate.joints.mean(axis=0)
-        return Tracked(estimate, share, used)
+        return Tracked(estimate, without_cameras(share, self.monitor.unfit), used)
 
     def shows_others(self, masks: NDArray[np.uint8], rig: Rig) -> bool:
         """Return whether masks (C, H, W) show more than this person: pixels far from the last body."""

@@ -1,8 +1,9 @@
 """The camera monitor: steps a tracker without the cameras that are wrong, and rejects impossible poses.
 
-Three checks exclude a camera: its image shows nothing or is frozen (:mod:`tk.model.masks.image_health`); in the opening
-frames its masks contradict those of the other cameras (:mod:`tk.model.masks.mask_agreement`); or, in a later frame,
-its residual is an outlier (:mod:`tk.trackers.residual_judge`).
+Three checks exclude a camera: its image shows nothing, is frozen, or has moved since the first frame, so that the
+calibration is no longer true (:mod:`tk.model.masks.image_health`); in the opening frames its masks contradict those of
+the other cameras (:mod:`tk.model.masks.mask_agreement`); or, in a later frame, its residual is an outlier
+(:mod:`tk.trackers.residual_judge`).
 
 Only contour trackers can go without a camera: a visual hull without one of its masks is empty.
 """
@@ -69,6 +70,7 @@ class CameraMonitor:
         self._health = ImageHealth()
         self._plausibility = Plausibility(setup.fps)
         C = len(self._names)
+        self.unfit = np.zeros(C, bool)  # cameras that their image excludes from the last frame
         self._excluded = np.zeros(C, bool)
         self._tested = False
         self._judge = ResidualJudge(tracker, setup.rig) if isinstance(tracker, RegionTracker) else None
@@ -124,7 +126,7 @@ class CameraMonitor:
     def step(self, frame: Observation) -> tuple[Estimate, Observation]:
         """Return the estimate for the next frame, and the observation without the excluded cameras."""
         unhealthy = self._health.look(frame.images, frame.masks)
-        bad = self._bad(unhealthy)
+        self.unfit = bad = self._bad(unhealthy)
         out = bad | self._excluded
         used = without_cameras(frame, out)
         if np.count_nonzero(shows_person(used.masks)) < 2:

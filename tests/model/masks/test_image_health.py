@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from tk.model.masks.image_health import BLANK, FROZEN, ImageHealth, contradiction, described, sampled
+from tk.model.masks.image_health import BLANK, FROZEN, MOVED, ImageHealth, contradiction, described, sampled
 
 C, H, W = 4, 96, 128
 
@@ -68,6 +68,22 @@ def test_frozen_camera_is_found_once_the_others_have_moved_until_it_moves_again(
     frozen = [t for t in range(14) if told[t][1] == FROZEN]
     # a frame's movement is a sixth of the bar: more than the threshold from the first or second frame on
     assert frozen in (list(range(4, 10)), list(range(5, 10)))
+
+
+def test_camera_that_is_moved_is_found_until_it_is_back() -> None:
+    rng, health = np.random.default_rng(0), ImageHealth()
+    scene = np.kron(rng.integers(0, 200, (C, 12, 16, 3)), np.ones((1, 8, 8, 1))).astype(np.uint8)
+    told = []
+    for t in range(36):
+        images, masks = frame(t, rng)
+        images = np.where(masks[..., None] > 0, images, scene)
+        if 8 <= t < 20:
+            images[2], masks[2] = np.roll(images[2], 3, axis=1), np.roll(masks[2], 3, axis=1)
+        told.append(health.look(images, masks))
+    assert all(reasons[c] is None for reasons in told for c in (0, 1, 3))
+    moved = [t for t in range(36) if told[t][2] == MOVED]
+    # a camera is looked at in its turn: after four frames at most
+    assert moved == list(range(moved[0], moved[-1] + 1)) and 8 <= moved[0] < 12 and 19 <= moved[-1] < 24
 
 
 def test_unchanged_images_are_healthy_while_nobody_moves() -> None:

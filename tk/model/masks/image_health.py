@@ -1,4 +1,4 @@
-"""Cameras whose image is blank, or frozen while the other cameras see movement; masks of other images."""
+"""Cameras that show nothing, stand still while the others see movement, or have been moved; masks of other images."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.mask_values import PERSON
+from tk.model.masks.image_shift import ImageShift
 
 # Rows of an image that are compared, approximately.
 _ROWS = 64
@@ -25,6 +26,10 @@ _SAME_LEVELS, _SAME_SHARE = 6, 0.001
 # to 29, with twice the value 5 to 29 of 29, because the person in fold moves little. No false alarm.
 _MOVED = 0.15
 
+# A camera has been moved if its image has, by more than this share of its longer side: 0.3° with a lens of 60°. The
+# images of the correct cameras of fifteen captures seem to move by 0.15 %, because of shadows.
+MOST_SHIFT = 0.005
+
 # Something moves in the images of a camera if at least this share of the pixels differs by more than this many levels:
 # the first is a quarter of a small person, the second more than the noise of 24 frames. Nine development captures have
 # 2.8 to 14 % of such pixels, with half and twice the levels 4 to 19 % and 0.6 to 9 %; a clip of an empty scene none.
@@ -38,7 +43,7 @@ _FOLLOWS = 0.87
 Sampled = tuple[NDArray[np.int16], NDArray[np.bool_]]
 """Images (C, h, w, 3) and masks (C, h, w) of a frame, every some pixels."""
 
-BLANK, FROZEN = "shows nothing", "stands still"
+BLANK, FROZEN, MOVED = "shows nothing", "stands still", "has been moved since the first frame"
 
 
 class ImageHealth:
@@ -47,14 +52,18 @@ class ImageHealth:
     An unchanged image is normal while nobody moves. So each camera keeps a reference: its last image that differed from
     the one before, with the masks of all cameras in that frame. The camera is frozen if its image still equals the
     reference, at least half of the other images have changed since, and most of these show that the person has moved.
+
+    The still parts of the image of a camera that stands firm stay where they are, see
+    :class:`~tk.model.masks.image_shift.ImageShift`.
     """
 
     def __init__(self) -> None:
         self._references: NDArray[np.uint8] | None = None  # (C, h, w) grey, of the reference frame of each camera
         self._masks: NDArray[np.bool_] | None = None  # (C, C, h, w): at camera c's reference frame those of all
+        self._shift = ImageShift()
 
     def look(self, images: NDArray[np.uint8], masks: NDArray[np.uint8]) -> list[str | None]:
-        """Return for each camera :data:`BLANK`, :data:`FROZEN` or, if nothing is wrong, None.
+        """Return for each camera :data:`BLANK`, :data:`FROZEN`, :data:`MOVED` or, if nothing is wrong, None.
 
         Args:
             images: (C, H, W, 3) BGR; if it is empty, frozen cameras are found from the masks alone.
@@ -70,6 +79,8 @@ class ImageHealth:
         if given:
             for c in np.flatnonzero(shown.reshape(C, -1).std(axis=1) < _BLANK_LEVELS).tolist():
                 found[c] = BLANK
+            for c in np.flatnonzero(self._shift.look(images, masks) > MOST_SHIFT).tolist():
+                found[c] = found[c] or MOVED
         if self._references is None or self._masks is None or self._references.shape != shown.shape:
             self._references, self._masks = shown, np.repeat(small[None], C, axis=0)
             return found
@@ -88,13 +99,15 @@ class ImageHealth:
         """Return what :meth:`restore` needs."""
         if self._references is None or self._masks is None:
             return {}
-        return {"references": self._references, "masks": np.packbits(self._masks)}
+        shift = {f"shift_{name}": value for name, value in self._shift.state().items()}
+        return {"references": self._references, "masks": np.packbits(self._masks), **shift}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state."""
         if "references" not in state:
             self._references = self._masks = None
             return
+        self._shift.restore({name[6:]: value for name, value in state.items() if name.startswith("shift_")})
         self._references = np.array(state["references"], np.uint8)
         C, h, w = self._references.shape
         bits = np.unpackbits(np.asarray(state["masks"], np.uint8), count=C * C * h * w)
