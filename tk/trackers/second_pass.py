@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -127,7 +128,7 @@ class SecondPass:
         """Optimise frames near their present poses."""
         tracker, grid = self.tracker, self.tracker.screen
         for chunk in (frames[k : k + AT_ONCE] for k in range(0, len(frames), AT_ONCE)):
-            seen = Pyramid.of_all([self._pyramid(i) for i in chunk])
+            seen = Pyramid((np.concatenate([self._seen(i) for i in chunk]),), (tracker.views.sizes,))
             prior = tracker.prior(self.poses[chunk], ANGLE_DEG)
             settled = tracker.settle(seen, self.poses[chunk], (0,), prior=prior)
             self.poses[chunk] = settled.states
@@ -165,40 +166,70 @@ class SecondPass:
             poses (A, F, D), and by how much they cost more than the present ones (A, F). Where an alternative has
             become the present pose, or costs :data:`MARGIN` more, its pose is the present one.
         """
-        tracker, skeleton, every = self.tracker, self.tracker.body.skeleton, self.tracker.search_frames
-        result = np.repeat(self.poses[None], len(alternatives), axis=0)
+        order, result = self.tracked[::step], np.repeat(self.poses[None], len(alternatives), axis=0)
         cost, mean = np.zeros(result.shape[:2]), np.full(len(alternatives), np.nan)  # NaN: none is tracked
-        for last, i in pairwise(self.tracked[::step]):
-            self._advance(1)
-            present, known, mean = self.poses[i], mean, np.full(len(alternatives), np.nan)
-            if i != last + step:
-                continue
-            here, poses = skeleton.joints(present), np.repeat(present[None], len(alternatives), axis=0)
-            for one, pose, near, tracked in zip(alternatives, poses, result[:, last], np.isfinite(known), strict=True):
-                if tracked or not one.legs:
-                    pose[one.dofs] = near[one.dofs]
-                elif every and i % every == 0:
-                    pose[:] = exchanged(present, *one.legs)
-            differ = np.flatnonzero(skeleton.apart(poses, here) > SAME_POSE_M)
-            if not len(differ):
-                continue
-            pyramid = self._pyramid(i, LEVEL + 1)
-            for k in differ.tolist():
-                start = poses[k][None].copy()
-                prior = tracker.prior(start, ANGLE_DEG)
-                poses[k] = tracker.settle(pyramid, start, (LEVEL,), prior=prior, limb=alternatives[k].limb).states[0]
-            differ = differ[skeleton.apart(poses[differ], here) > SAME_POSE_M]
-            if not len(differ):
-                continue
-            costs = self._costs(pyramid, np.concatenate([present[None], poses[differ]]))
-            more = costs[1:] - costs[0]
-            mean[differ] = np.where(np.isnan(known[differ]), more, known[differ] + RENEWAL * (more - known[differ]))
-            mean[mean > MARGIN] = np.nan
-            kept = np.isfinite(mean[differ])
-            # a limb behind other people costs nothing, and only the first pass sees its colours
-            hidden = COST * (pyramid.masks[0] == OTHERS).any()
-            result[differ[kept], i], cost[differ[kept], i] = poses[differ[kept]], more[kept] + hidden
+        for begin in range(0, len(order) - 1, AT_ONCE):
+            frames = order[begin + 1 : begin + 1 + AT_ONCE]
+            lasts, seen = order[begin : begin + len(frames)], cache(lambda i: self._pyramid(i, LEVEL + 1))
+            # most alternatives become the present pose at once: those that begin are settled together
+            starts = np.stack([self._starts(one, lasts, frames, step) for one in alternatives])
+            begun = self._settled(alternatives, starts, frames, seen)
+            self._advance(len(frames))
+            for n, (last, i) in enumerate(zip(lasts.tolist(), frames.tolist(), strict=True)):
+                known, mean = mean, np.full(len(alternatives), np.nan)
+                if i != last + step:
+                    continue
+                present, poses = self.poses[i], begun[:, n]
+                if tracked := np.flatnonzero(np.isfinite(known)).tolist():
+                    going_on = [alternatives[k] for k in tracked]
+                    starts = np.repeat(present[None, None], len(tracked), axis=0)
+                    for start, near, one in zip(starts[:, 0], result[tracked, last], going_on, strict=True):
+                        start[one.dofs] = near[one.dofs]
+                    poses[tracked] = self._settled(going_on, starts, frames[n : n + 1], seen)[:, 0]
+                differ = np.flatnonzero((poses != present).any(axis=1))
+                if not len(differ):
+                    continue
+                pyramid = seen(i)
+                costs = self._costs(pyramid, np.concatenate([present[None], poses[differ]]))
+                more = costs[1:] - costs[0]
+                mean[differ] = np.where(np.isnan(known[differ]), more, known[differ] + RENEWAL * (more - known[differ]))
+                mean[mean > MARGIN] = np.nan
+                kept = np.isfinite(mean[differ])
+                # a limb behind other people costs nothing, and only the first pass sees its colours
+                hidden = COST * (pyramid.masks[0] == OTHERS).any()
+                result[differ[kept], i], cost[differ[kept], i] = poses[differ[kept]], more[kept] + hidden
         return result, cost
+
+    def _starts(self, one: Alternative, lasts: NDArray[np.int64], frames: NDArray[np.int64], step: int) -> Float:
+        """Return the poses (N, D) from which an alternative begins in N frames; the present one where it does not."""
+        poses, every, follows = self.poses[frames], self.tracker.search_frames, frames == lasts + step
+        if not one.legs:
+            poses[np.ix_(follows, one.dofs)] = self.poses[np.ix_(lasts[follows], one.dofs)]
+        elif every:
+            for n in np.flatnonzero(follows & (frames % every == 0)).tolist():
+                poses[n] = exchanged(poses[n], *one.legs)
+        return poses
+
+    def _settled(
+        self,
+        alternatives: Sequence[Alternative],
+        starts: Float,
+        frames: NDArray[np.int64],
+        seen: Callable[[int], Pyramid],
+    ) -> Float:
+        """Return what the starts (A, N, D) of alternatives converge to in N frames; the present pose where that, or the
+        start, is near the present pose."""
+        tracker, skeleton, present = self.tracker, self.tracker.body.skeleton, self.poses[frames]
+        joints, result = skeleton.joints(present), np.repeat(present[None], len(alternatives), axis=0)
+        far = skeleton.apart(starts, joints) > SAME_POSE_M
+        for one, poses, start, differ in zip(alternatives, result, starts, far, strict=True):
+            if differ.any():
+                pyramid = Pyramid.of_all([seen(i) for i in frames[differ].tolist()], LEVEL)
+                prior = tracker.prior(start[differ], ANGLE_DEG)
+                poses[differ] = tracker.settle(pyramid, start[differ], (LEVEL,), prior=prior, limb=one.limb).states
+        if far.any():
+            result = np.where(skeleton.apart(result, joints)[..., None] > SAME_POSE_M, result, present)
+        return result
 
     def _advance(self, frames: int) -> None:
         """Report the share that is done: every frame is optimised once and tracked twice, some are optimised again."""
@@ -206,11 +237,16 @@ class SecondPass:
         self._report(min(self._done / (3 * len(self.tracked)), 1.0))
 
     def _pyramid(self, i: int, scales: int = 1) -> Pyramid:
-        """Return the masks of frame i, empty where a camera is not used."""
+        """Return the scales of the masks of frame i."""
+        return self.tracker.views.pyramid(self._seen(i), scales, False)
+
+    def _seen(self, i: int) -> NDArray[np.uint8]:
+        """Return the masks (C, H, W) of frame i, empty where a camera is not used."""
         shown, out = self._masks[int(i)], np.isnan(self.residual[i, :, 0])
         if out.any():
-            shown = np.where(out[:, None, None], np.uint8(0), shown)
-        return self.tracker.views.pyramid(shown, scales, False)
+            shown = shown.copy()
+            shown[out] = 0
+        return shown
 
     def _costs(self, pyramid: Pyramid, poses: Float) -> Float:
         """Return the costs (B,) of poses (B, D) by masks alone, mean over the views."""

@@ -40,9 +40,11 @@ class Pyramid:
     sizes: tuple[NDArray[np.int32], ...]  # (V, 2) for each scale, width and height of each camera's image
 
     @staticmethod
-    def of_all(frames: Sequence[Pyramid]) -> Pyramid:
-        """Join the pyramids of several frames."""
-        return Pyramid(tuple(map(np.concatenate, zip(*(f.masks for f in frames), strict=True))), frames[0].sizes)
+    def of_all(frames: Sequence[Pyramid], scale: int) -> Pyramid:
+        """Join one scale of several frames; the others are empty."""
+        none = np.zeros((0, 0, 0), np.uint8)
+        joined = np.concatenate([frame.masks[scale] for frame in frames])
+        return Pyramid((none,) * scale + (joined,), frames[0].sizes[: scale + 1])
 
     def of_views(self, views: NDArray[np.intp]) -> Pyramid:
         """Return the scales of some views."""
