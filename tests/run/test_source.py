@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from tests.conftest import QUICK, Silent, refused
 from tests.model.figures import draw_silhouettes
@@ -68,7 +69,7 @@ class Rendered:
     def shifted(self, time_offset_s: Sequence[float]) -> None:
         return None
 
-    def damaged(self, stop: int) -> tuple[()]:
+    def damaged(self, stop: int, cameras: NDArray[np.bool_]) -> tuple[()]:
         return ()
 
 

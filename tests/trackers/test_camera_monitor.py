@@ -174,6 +174,7 @@ def test_camera_with_torn_mask_is_excluded_until_its_masks_are_whole(scene: Scen
     # included again after six frames with whole masks
     assert [bool(u[1]) for u in used] == [True] * 2 + [False] * 9 + [True] * (FRAMES - 11)
     assert monitor.report() == ["camera cam2 misses a part of the person: left out of frames 2 to 10"]
+    assert np.flatnonzero(monitor.doubted).tolist() == [1]
     assert not any(e.status == "lost" for e in estimates)
     assert scene.error(estimates, range(FRAMES)) < 0.05
 
@@ -275,6 +276,7 @@ def test_impossible_pose_is_lost(scene: Scene) -> None:
     assert [e.status for e in estimates] == ["tracked"] * 3 + ["lost"] + ["tracked"] * 2
     assert estimates[3].sigma is not None and np.isnan(estimates[3].sigma).all()
     assert monitor.report() == ["the pose found cannot be true: it jumps: lost, frame 3"]
+    assert monitor.doubted.all()
 
 
 def test_resumed_run_is_the_same(scene: Scene) -> None:

@@ -137,7 +137,8 @@ class Loop:
                     if self.people.start([o for o, _ in opening], source.has_masks):
                         break
             except CaptureError as error:
-                reasons = "; ".join([str(error), *source.damaged(opening[-1][0].index + 1)])
+                every = np.ones(len(self.plan.task.setup.rig), np.bool_)
+                reasons = "; ".join([str(error), *source.damaged(opening[-1][0].index + 1, every)])
                 raise CaptureError(f"{source.where}: {reasons}", error.hint) from None
             yield opening.pop(0)
             observations = _fill(opening, observations, count)

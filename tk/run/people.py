@@ -19,6 +19,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ConfigError
 from tk.kernels.mask_values import OTHERS, PERSON
@@ -392,6 +393,11 @@ class People:
         )
 
     # --- what a result keeps ------------------------------------------------------------------------------------------
+
+    @property
+    def doubted(self) -> NDArray[np.bool_]:
+        """(C,) cameras, see :attr:`CameraMonitor.doubted`."""
+        return np.any([member.monitor.doubted for member in self.members], axis=0)
 
     def report(self) -> list[str]:
         """Return lines on excluded cameras and losses, see :meth:`CameraMonitor.report`."""

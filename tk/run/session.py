@@ -130,7 +130,7 @@ def track_task(task: Task, output: Path, reporter: Reporter, resume: bool = Fals
                     reporter.advance(frame, estimates[0] if estimates else None)
             if loop.tracked or loop.restore_unfinished(output):
                 if lines := loop.people.report():  # a damaged image may be the cause
-                    lines = [*task.source.damaged(plan.begin + done + loop.tracked), *lines]
+                    lines = [*task.source.damaged(plan.begin + done + loop.tracked, loop.people.doubted), *lines]
                 for line in lines:
                     note(line)
                 with one_thread():

@@ -180,6 +180,13 @@ class CameraMonitor:
         residual refuses a pose. With twice the limit, a mirrored pose was accepted for 12 frames (fault "away")."""
         return self._judge.normal if self._judge is not None and self._refused >= 1 / RATE else 1.0
 
+    @property
+    def doubted(self) -> NDArray[np.bool_]:
+        """(C,) the cameras whose images may be the cause of a line of :meth:`report`: those that were left out, which
+        the others contradicted; all of them if the person was lost."""
+        left_out = {int(key.partition("/")[0]) for key in self._spans}
+        return np.array([bool(self._lost) or camera in left_out for camera in range(len(self._names))])
+
     def report(self) -> list[str]:
         """Return a line for each camera and reason of exclusion, and for each reason of a loss."""
         lines = []

@@ -166,10 +166,12 @@ class Capture:
         ends = [clip.frame_count + late for clip, late in zip(self.clips, moved.late_frames, strict=True)]
         return replace(moved, frame_count=min(self.frame_count, *ends))
 
-    def damaged(self, stop: int) -> list[str]:
-        """Return a line on each video with images before frame ``stop`` that cannot be decoded completely."""
+    def damaged(self, stop: int, cameras: NDArray[np.bool_]) -> list[str]:
+        """Return a line on each video of some cameras, (C,) bool, with images before frame ``stop`` that cannot be
+        decoded completely."""
         lines = []
-        for clip, late in zip(self.clips, self.late_frames, strict=True):
+        for camera in np.flatnonzero(cameras).tolist():
+            clip, late = self.clips[camera], self.late_frames[camera]
             if isinstance(clip, VideoClip) and (bad := damaged_images(clip.path, min(stop - late, _CHECKED_IMAGES))):
                 which = described(bad[0] + late, bad[-1] + late, len(bad))
                 lines.append(f"{clip.path}: is damaged in {which}; copy it again, or re-encode the original")

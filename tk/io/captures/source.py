@@ -75,6 +75,7 @@ class Source(Protocol):
         """Return the same frames with other delays (C,); None if they cannot be read a second time."""
         ...
 
-    def damaged(self, stop: int) -> Sequence[str]:
-        """Return a line on each camera some of whose images before frame ``stop`` are damaged."""
+    def damaged(self, stop: int, cameras: NDArray[np.bool_]) -> Sequence[str]:
+        """Return a line on each of some cameras, (C,) bool, with damaged images before frame ``stop``. This may decode
+        all of their images again."""
         ...
