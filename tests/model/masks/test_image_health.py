@@ -82,8 +82,8 @@ def test_camera_that_is_moved_is_found_until_it_is_back() -> None:
         told.append(health.look(images, masks))
     assert all(reasons[c] is None for reasons in told for c in (0, 1, 3))
     moved = [t for t in range(36) if told[t][2] == MOVED]
-    # a camera is looked at in its turn: after four frames at most
-    assert moved == list(range(moved[0], moved[-1] + 1)) and 8 <= moved[0] < 12 and 19 <= moved[-1] < 24
+    # a camera is looked at in its turn: after eight frames at most
+    assert moved == list(range(moved[0], moved[-1] + 1)) and 8 <= moved[0] < 16 and 19 <= moved[-1] < 28
 
 
 def test_unchanged_images_are_healthy_while_nobody_moves() -> None:

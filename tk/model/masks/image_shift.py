@@ -23,6 +23,10 @@ _SIZE = 96
 # Standard deviations of the Gaussians between which the details lie that are compared, pixels: finer ones are noise and
 # limit the reach, coarser ones are shadows and light.
 _FINE, _COARSE = 1.0, 3.0
+# A camera is looked at in every second frame: a tripod moves for longer.
+_PAUSE = 2
+# Every second pixel of each row and column is compared: the details are wider.
+_EVERY = 2
 # Iterations, and the last step in pixels, after which a registration ends.
 _ITERATIONS, _CONVERGED = 8, 0.02
 # Tukey's constant: 95 % efficiency for normal noise.
@@ -34,13 +38,13 @@ _LEAST_CORRELATION = 0.75
 
 
 class ImageShift:
-    """Registers the images of consecutive frames with those of the first one, one camera a frame."""
+    """Registers the images of consecutive frames with those of the first one, one camera in every second frame."""
 
     def __init__(self) -> None:
-        self._first: Gray | None = None  # (C, h, w)
+        self._first: NDArray[np.uint8] | None = None  # (C, h, w)
         self._still = np.zeros((0, 0, 0), np.bool_)  # (C, h, w), where nobody is in the first frame
         self._shift = np.zeros((0, 2))
-        self._next = 0
+        self._calls = 0
 
     def look(self, images: NDArray[np.uint8], masks: NDArray[np.uint8]) -> Float:
         """Return (C,) how far each camera's image has moved, as a share of its longer side; NaN if it is unknown.
@@ -51,12 +55,18 @@ class ImageShift:
         """
         C = len(images)
         if self._first is None or len(self._first) != C:
-            self._first = np.stack([_filtered(image) for image in images])
+            self._first = np.stack([_small(image[..., 1]) for image in images])  # the green channel suffices
             self._still = np.stack([_beside(mask) for mask in masks])
-            self._shift, self._next = np.zeros((C, 2)), 0
-            return np.zeros(C)
-        c = self._next
-        first, now = self._first[c], _filtered(images[c])
+            self._shift, self._calls = np.zeros((C, 2)), 0
+        if self._calls % _PAUSE:
+            self._look_at(self._calls // _PAUSE % C, images, masks)
+        self._calls += 1
+        return np.asarray(np.hypot(*self._shift.T) / _SIZE)
+
+    def _look_at(self, c: int, images: NDArray[np.uint8], masks: NDArray[np.uint8]) -> None:
+        """Measure a camera's shift."""
+        assert self._first is not None
+        first, now = _details(self._first[c]), _details(_small(images[c, ..., 1]))
         still_now = _beside(masks[c])
         if still_now.mean() < _FREE:  # no mask of a person; that of a moved camera shows half of the scene
             still_now[:] = True
@@ -65,24 +75,22 @@ class ImageShift:
         if correlation < _LEAST_CORRELATION:  # a jump is out of the reach of small steps
             shift, correlation = _register(first, now, still, _jump(first * self._still[c], now * still_now))
         self._shift[c] = shift if correlation >= _LEAST_CORRELATION else np.nan
-        self._next = (c + 1) % C
-        return np.asarray(np.hypot(*self._shift.T) / _SIZE)
 
     def state(self) -> Mapping[str, Any]:
         """Return what :meth:`restore` needs."""
         if self._first is None:
             return {}
-        return {"first": self._first, "still": self._still, "shift": self._shift, "next": self._next}
+        return {"first": self._first, "still": self._still, "shift": self._shift, "calls": self._calls}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state."""
         if "first" not in state:
             self._first = None
             return
-        self._first = np.array(state["first"], np.float32)
+        self._first = np.array(state["first"], np.uint8)
         self._still = np.array(state["still"], np.bool_)
         self._shift = np.array(state["shift"], np.float64)
-        self._next = int(state["next"])
+        self._calls = int(state["calls"])
 
 
 def _small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -93,9 +101,9 @@ def _small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(image[::every, ::every], size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _filtered(image: NDArray[np.uint8]) -> Gray:
-    """Return (h, w) the details of an image (H, W, 3) at low resolution; the green channel suffices."""
-    gray = _small(image[..., 1]).astype(np.float32)
+def _details(image: NDArray[np.uint8]) -> Gray:
+    """Return the details of an image (h, w)."""
+    gray = image.astype(np.float32)
     return np.asarray(cv2.GaussianBlur(gray, (0, 0), _FINE) - cv2.GaussianBlur(gray, (0, 0), _COARSE), np.float32)
 
 
@@ -122,17 +130,19 @@ def _register(first: Gray, now: Gray, still: NDArray[np.bool_], shift: Float) ->
         shift: (2,) where to begin.
     """
     h, w = first.shape
-    gradient = np.stack([cv2.Sobel(first, cv2.CV_32F, dx, 1 - dx, scale=1 / 8) for dx in (1, 0)], axis=-1)
-    inside, border = np.zeros((h, w), np.uint8), round(_COARSE)
-    inside[border : h - border, border : w - border] = 1
-    still = still & (inside > 0)
+    y, x = (_EVERY * at for at in np.nonzero(still[::_EVERY, ::_EVERY]))
+    gradient = np.stack([cv2.Sobel(first, cv2.CV_32F, dx, 1 - dx, scale=1 / 8)[y, x] for dx in (1, 0)], axis=-1)
+    border = np.array([_COARSE, _COARSE])
     correlation = 0.0
     for _ in range(_ITERATIONS):
-        warp = np.array([[1.0, 0.0, -shift[0]], [0.0, 1.0, -shift[1]]])
-        seen = still & (cv2.warpAffine(inside, warp, (w, h)) > 0)
-        if seen.mean() < _LEAST_STILL:
+        before = np.stack([x, y], axis=-1).astype(np.float64)
+        now_at = before + shift
+        seen = np.all([(at >= border) & (at <= (w - 1, h - 1) - border) for at in (before, now_at)], axis=(0, 2))
+        if seen.sum() < _LEAST_STILL * h * w / _EVERY**2:
             return shift, 0.0
-        moved, reference, G = cv2.warpAffine(now, warp, (w, h))[seen], first[seen], gradient[seen]
+        at_x, at_y = now_at[seen].T.astype(np.float32)
+        moved = cv2.remap(now, at_x, at_y, cv2.INTER_LINEAR).ravel()
+        reference, G = first[y[seen], x[seen]], gradient[seen]
         difference = moved - reference
         noise = 1.4826 * float(np.median(np.abs(difference))) + 1e-3
         weight = np.clip(1.0 - (difference / (_TUKEY * noise)) ** 2, 0.0, None) ** 2
