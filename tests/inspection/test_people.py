@@ -107,14 +107,28 @@ def test_one_person_is_listed_without_a_finding(tk: Tk, tmp_path: Path) -> None:
     assert "people are in view" not in ran.out
 
 
+def person(x: float) -> LocatedPerson:
+    position = np.array([x, 0.0, 0.9])
+    return LocatedPerson(position, 1.7, 0.08, position[None], 0.06, np.ones(4, bool), np.ones(4), abs(x) < 1.3)
+
+
+def test_people_are_numbered_in_the_order_in_which_they_enter_the_volume(
+    crossing: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second, third, never = 0.1, 0.5, 1.1, 2.5
+    looks = iter([[never, 1.5, first], [never, 1.4, first, second]] + 20 * [[never, third, first, second]])
+    monkeypatch.setattr(PeopleFinder, "find", lambda *_: tuple(map(person, next(looks))))
+    watch = PeopleWatch(open_capture(crossing), FRAMES)
+    for index in filter(watch.wants, range(FRAMES)):
+        watch.look(index, np.zeros((4, 120, 160), np.uint8), None)
+    assert [(p.number, p.path[-1][0]) for p in watch.people()] == list(enumerate([first, second, third, never]))
+    assert [p.enters for p in watch.people()] == [0, 3, 6, None]
+
+
 def test_numbers_of_the_first_frame_stay_when_a_ghost_is_left_out(
     crossing: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """`tk track` counts everybody who is found in the first frame."""
-
-    def person(x: float) -> LocatedPerson:
-        position = np.array([x, 0.0, 0.9])
-        return LocatedPerson(position, 1.7, 0.08, position[None], 0.06, np.ones(4, bool), np.ones(4), True)
 
     looks = iter([(person(0.1), person(0.3), person(1.0))] + 20 * [(person(0.1), person(1.0))])
     monkeypatch.setattr(PeopleFinder, "find", lambda *_: next(looks))

@@ -263,19 +263,32 @@ def test_the_subject_position_chooses_the_person() -> None:
         assert far_off(found.joints[None], person) < 0.1
 
 
-def test_a_number_that_nobody_has_is_refused() -> None:
-    with refused(CaptureError, "person 2 is asked for, but 2 were found"):
-        list(estimates(task(PAIR, Rendered(MASKS.max(axis=0)), people=(2,))))
+def test_a_number_that_nobody_gets_is_an_error_or_a_note(tmp_path: Path) -> None:
+    source = Rendered(MASKS.max(axis=0))
+    with refused(CaptureError, "person 2 did not enter the working volume"):
+        track_task(task(PAIR, source, people=(2,)), tmp_path / "r.h5", Silent())
+    assert not list(tmp_path.iterdir())
+    reporter = Silent()
+    track_task(task(PAIR, source, people=(2, 1), causal=True), tmp_path / "r.h5", reporter)
+    (found,) = read_result(tmp_path / "r.h5").people
+    assert min(far_off(found.joints, who) for who in (0, 1)) < 0.04
+    assert reporter.notes == [
+        "person 2 is not in the working volume in frame 0, and is awaited",
+        "person 2 did not enter the working volume",
+    ]
 
 
-def track_entering(path: Path, count: int) -> tuple[np.ndarray, tuple[Result, ...]]:
+def track_entering(
+    path: Path, count: int, people: Choice = "all", stop: int | None = None, resume: bool = False
+) -> tuple[np.ndarray, tuple[Result, ...]]:
     """Return the poses and the results of two people; person 1 is there in frames 3 to 16."""
     poses = np.array([walk(count), walk(count, first=0.4)])
     poses[:, :, :2] += [[[0.35, -0.05]], [[-0.35, 0.05]]]
     masks = np.array([draw_silhouettes(BODY, FOUR, own) for own in poses])
     masks[1, :3] = masks[1, 17:] = 0
     setup = replace(PAIR, fps=4.0, subjects=PAIR.subjects[:1])
-    track_task(task(setup, Rendered(masks.max(axis=0)), people="all", causal=True), path, Silent())
+    run = task(setup, Rendered(masks.max(axis=0)), people=people, causal=True, frames=(0, stop))
+    track_task(run, path, Silent(), resume=resume)
     return poses, read_result(path).people
 
 
@@ -289,6 +302,45 @@ def test_somebody_who_enters_gets_a_number_and_who_leaves_is_absent(tmp_path: Pa
     for own, result in zip(poses, (first, second), strict=True):
         joints = np.array([BODY.skeleton.joints(pose) for pose in own[result.frames]])
         assert np.median(np.linalg.norm(result.joints - joints, axis=2)) < 0.1  # coarse settings
+
+
+def test_somebody_who_enters_later_can_be_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begin, subjects = People._begin, []
+
+    def watch(people: People, member: Member, *rest: Any) -> None:
+        subjects.append(member.subject)
+        begin(people, member, *rest)
+
+    monkeypatch.setattr(People, "_begin", watch)
+    count = 19
+    poses, (found,) = track_entering(tmp_path / "r.h5", count, (1,))
+    np.testing.assert_array_equal(found.frames, np.arange(count))
+    (here,) = np.nonzero(found.status != Status.ABSENT)
+    assert 3 < here[0] < 16 and not (found.status == Status.LOST).any() and np.isfinite(found.pose).all()
+    np.testing.assert_array_equal(here, np.arange(here[0], 17))
+    joints = np.array([BODY.skeleton.joints(pose) for pose in poses[1][here]])
+    assert np.median(np.linalg.norm(found.joints[here] - joints, axis=2)) < 0.1  # coarse settings
+    assert [subject.body for subject in subjects] == [None, BODY]  # the subject is the one who is chosen
+
+
+@pytest.mark.parametrize("people", [(1,), (1, 0)])
+def test_a_run_with_somebody_who_enters_later_is_resumed(tmp_path: Path, people: Choice) -> None:
+    count = 17
+    _, whole = track_entering(tmp_path / "whole.h5", count, people)
+    if len(people) > 1:  # in the order in which they came
+        _, expected = track_entering(tmp_path / "all.h5", count, "all")
+        for one, other in zip(whole, expected, strict=True):
+            np.testing.assert_array_equal(one.pose, other.pose)
+    for stop, resume in ((3, False), (14, True), (None, True)):  # before and after the person enters
+        if stop == 3 and len(people) == 1:
+            with refused(CaptureError, "person 1 did not enter"):
+                track_entering(tmp_path / "part.h5", count, people, stop, resume)
+        else:
+            track_entering(tmp_path / "part.h5", count, people, stop, resume)
+    for one, other in zip(read_result(tmp_path / "part.h5").people, whole, strict=True):
+        np.testing.assert_array_equal(one.frames, other.frames)
+        np.testing.assert_array_equal(one.pose, other.pose)
+        np.testing.assert_array_equal(one.status, other.status)
 
 
 def test_attempts_to_track_somebody_who_is_refused_are_twice_as_far_apart_each_time(

@@ -76,6 +76,11 @@ class _Path:
     def last(self) -> tuple[int, LocatedPerson]:
         return self.found[-1]
 
+    @property
+    def enters(self) -> int | None:
+        """First frame in which the person is in the working volume."""
+        return next((index for index, person in self.found if person.inside), None)
+
 
 class PeopleWatch:
     """Follows the people of a capture over its sampled frames, in order.
@@ -86,8 +91,8 @@ class PeopleWatch:
 
     Attributes:
         entered: frame of the first look in which the working volume was not empty; 0 if it is the first of all, None
-            before it. People in this look have the first numbers, in the order of :func:`order_people`, as in
-            `tk track`; others follow as they came.
+            before it. People who are then in the volume have the first numbers, in the order of :func:`order_people`,
+            as in `tk track`; then come those who enter it later, in this order, and last those who never do.
     """
 
     def __init__(self, capture: Capture, span: int) -> None:
@@ -99,7 +104,7 @@ class PeopleWatch:
         self._open: list[_Path] = []
         self._looks = 0
         self.entered: int | None = None
-        self._first: list[_Path] = []  # the people in that look
+        self._first: list[_Path] = []  # the people in the volume in that look
 
     def wants(self, index: int) -> bool:
         """Return whether to :meth:`look` at a frame."""
@@ -135,12 +140,12 @@ class PeopleWatch:
                 self._open.append(taken[k])
             taken[k].found.append((index, person))
         if enter:
-            self._first = [taken[k] for k in range(len(found))]
-            self._paths = self._first + [path for path in self._paths if path not in self._first]
+            # if cameras contradict each other, everybody may seem to be outside
+            self._first = [taken[k] for k, person in enumerate(found) if person.inside or k == 0]
 
     def of_first(self, index: int, masks: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the masks (C, H, W) of a frame with the pixels of everybody but person 0 as those of others."""
-        rig, path = self._capture.rig, self._paths[0].found
+        rig, path = self._capture.rig, self._numbered()[0].found
         last = min(path, key=lambda look: abs(look[0] - index))[1]
         found = self._finder.find(masks)
         by_distance = sorted(found, key=lambda person: float(np.linalg.norm(person.position - last.position)))
@@ -154,11 +159,16 @@ class PeopleWatch:
         """Return the people. Somebody who was seen only for a moment is left out; the numbers of the people in the look
         :attr:`entered` stay."""
         least = min(1 + round(_SEEN_S * self._capture.fps / self._every), self._looks)
-        kept = [path for path in self._paths if path in self._first or len(path.found) >= least]
-        return tuple(self._report(k, path.found) for k, path in enumerate(kept) if len(path.found) >= least)
+        kept = [path for path in self._numbered() if path in self._first or len(path.found) >= least]
+        return tuple(self._report(k, path) for k, path in enumerate(kept) if len(path.found) >= least)
 
-    def _report(self, number: int, found: Sequence[tuple[int, LocatedPerson]]) -> PersonReport:
-        people = [person for _, person in found]
+    def _numbered(self) -> list[_Path]:
+        """Return the paths in the order of their numbers, see :attr:`entered`."""
+        later = [path for path in self._paths if path not in self._first]
+        return self._first + sorted(later, key=lambda path: np.inf if path.enters is None else path.enters)
+
+    def _report(self, number: int, path: _Path) -> PersonReport:
+        found, people = path.found, [person for _, person in path.found]
         shown = np.mean([person.views for person in people], axis=0)
         return PersonReport(
             number=number,
@@ -166,7 +176,7 @@ class PeopleWatch:
             path=tuple((float(x), float(y), float(z)) for x, y, z in (person.position for person in people)),
             height_m=float(np.median([person.height_m for person in people])),
             inside=float(np.mean([person.inside for person in people])),
-            enters=next((index for index, person in found if person.inside), None),
+            enters=path.enters,
             views=tuple(int(person.views.sum()) for person in people),
             cameras=tuple(name for name, share in zip(self._capture.rig.names, shown, strict=True) if share > 0.5),
         )
@@ -195,9 +205,9 @@ def many_people(people: Sequence[PersonReport], entered: int) -> list[str]:
                 f"person {person.number} stays outside the volume, in {', '.join(person.cameras)}: tk track does not "
                 "take these pixels for the subject's"
             )
-        elif person.enters > max(person.frames[0], entered):
+        elif person.enters > min(p.enters for p in inside if p.enters is not None):
             lines.append(
-                f"person {person.number} enters the volume at about frame {person.enters}: --people all takes this "
-                "person from then on"
+                f"person {person.number} enters the volume at about frame {person.enters}: --people {person.number} "
+                "takes this person from then on"
             )
     return lines

@@ -18,29 +18,25 @@ from tk.run.task import Choice
 def chosen(
     choice: Choice, found: Sequence[LocatedPerson], subject: Subject, note: Callable[[str], None]
 ) -> tuple[int, ...]:
-    """Return the numbers of the people to be tracked among those found in the first frame.
+    """Return the numbers of the people in the result among those found in the first frame: who is chosen and stands in
+    the volume. If nobody stands there, number 0 does.
 
     Raises:
-        CaptureError: a chosen person is not there.
+        CaptureError: a chosen person is seen by one camera.
     """
-    present = [n for n, person in enumerate(found) if person.inside]
+    present = tuple(n for n, person in enumerate(found) if person.inside) or (0,)
     if isinstance(choice, tuple):
-        missing = [n for n in choice if n >= len(found)]
-        if missing:
-            raise CaptureError(
-                f"person {missing[0]} is asked for, but {len(found)} were found in the first frame; the numbers "
-                "start at 0, see tk inspect"
-            )
-        for n in choice:
+        numbers = tuple(n for n in choice if n in present)
+        for n in numbers if len(found) > 1 else ():
             if found[n].views.sum() < 2:
                 raise CaptureError(
                     f"person {n} is seen by one camera in the first frame, and two are needed: choose all, or a later "
                     "first frame",
                     hint="with --frames N:",
                 )
-        return choice
+        return numbers
     if choice == "all":
-        return tuple(present) or (0,)
+        return present
     number = 0
     place = _position(subject)
     if place is not None and found:
@@ -77,6 +73,8 @@ def matched(subjects: Sequence[Subject], people: Sequence[LocatedPerson], up: st
             if place is None and subject.height_m is None:
                 cost[p, s] += _UNKNOWN_M
             cost[p, s] += 1e-6 * abs(p - s)
+    if not people:
+        return []
     if len(subjects) == 1:  # SciPy's optimisation takes 0.3 s to import
         who = {int(cost.argmin()): 0}
     else:

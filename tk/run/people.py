@@ -3,7 +3,8 @@
 People are found by their visual hulls, in the first frame in which somebody stands in the working volume. Everybody
 there gets a tracker, also people who are not written, because a body separates their pixels from those of others
 (:mod:`tk.trackers.sharing`). Pixels that no body explains show somebody unknown. They are no evidence for the people
-who are tracked. A person who enters is found in them.
+who are tracked. A person who enters is found in them. While somebody is awaited whom the user has chosen by number,
+everybody keeps a number while away, as if all were written.
 
 A person who is alone in view gets the whole masks.
 """
@@ -56,6 +57,7 @@ _SAME_COLORS = -1.1
 
 _PEOPLE = "people/"
 _SUBJECT, _IN_INIT_POSE = "subject", "in_init_pose"  # the number of the subject, -1: unknown
+_NUMBER, _GIVEN = "number", "given"
 _MODEL, _CONTACTS = "body/", "contacts/"
 
 
@@ -77,6 +79,8 @@ class People:
         self._unknown: deque[Observation] = deque(maxlen=_HISTORY)  # people who are unknown, in the last frames
         self._refused = 0  # consecutive people who could not be tracked
         self._admit_from = 0  # the frame from which on another may be
+        # numbers, as `tk inspect` prints them, of the people who have had a tracker; None before the first frame
+        self._given: set[int] | None = None
         #: why nobody is tracked yet; empty before the first frame
         self.refusal = ""
         share = sharing(first)
@@ -111,10 +115,15 @@ class People:
         present."""
         return self._choice == "all" or (self._choice != "auto" and len(self._choice) > 1)
 
+    @property
+    def _awaited(self) -> set[int]:
+        """Numbers, as `tk inspect` prints them, of chosen people who have not entered yet."""
+        return set(self._choice) - self._given if isinstance(self._choice, tuple) and self._given is not None else set()
+
     # --- the first frames ---------------------------------------------------------------------------------------------
 
     def start(self, opening: Sequence[Observation], given_masks: bool = False) -> bool:
-        """Find the people in the first frame, and start a tracker for everybody in the volume and everybody chosen.
+        """Find the people in the first frame, and start a tracker for everybody in the volume.
 
         Masks that were made from the images belong to them; ``given_masks`` are compared with them.
 
@@ -123,8 +132,7 @@ class People:
             call this method again with the frames from the next one on.
 
         Raises:
-            CaptureError: a chosen person is not there; or, in the first call, too few cameras see the person, or the
-                masks do not belong to the images.
+            CaptureError: in the first call, too few cameras see the person, or the masks do not belong to the images.
         """
         frame, subjects = opening[0], self._setup.subjects
         found = self._finder.find(frame.masks, frame.uncertain)
@@ -143,10 +151,10 @@ class People:
             self._begin_in_any_pose()
         _LOG.info("finding the person in frame %d and fitting the body to %d frames", frame.index, len(opening))
         found = order_people(found, self._setup.volume, subjects[0].height_m, subjects[0].position)
-        if self._grid is None and len(found) > 1:
+        numbers = chosen(self._choice, found, subjects[0], self._note)
+        alone = len(found) <= 1 and 0 in numbers
+        if self._grid is None and not (alone and self._choice in ("auto", "all", (0,))):
             raise ConfigError(f"the method {self._first.method} tracks one person who is alone in view")
-        alone = len(found) <= 1 and self._choice in ("auto", "all", (0,))
-        numbers = (0,) if alone else chosen(self._choice, found, subjects[0], self._note)
         try:
             compared = spread_over(opening) if given_masks else ()
             if reason := contradiction(pairwise(sampled(f.images, f.masks) for f in compared)):
@@ -156,16 +164,22 @@ class People:
             if not entered:
                 raise
             self._refuse(frame.index, error)
-            self._tracked = []
+            self._tracked, self._given = [], None
             return False
         if entered:
             self._note(f"frame {frame.index}: the first person has entered")
+        for number in sorted(self._awaited):
+            self._note(f"person {number} is not in the working volume in frame {frame.index}, and is awaited")
+            self.refusal = f"{_not_entered(number)}; tk inspect prints the numbers, from 0"
         return True
 
-    def _begin_in_any_pose(self) -> None:
-        """Take the pose in which the subjects begin for unknown, because it is not that of the first frame."""
-        subjects = tuple(replace(s, in_init_pose=False) for s in self._setup.subjects)
-        self._setup = replace(self._setup, subjects=subjects)
+    def _begin_in_any_pose(self, number: int | None = None) -> None:
+        """Take the pose in which a subject, or each, begins for unknown, because it is not that of the first frame."""
+        subjects = [
+            replace(s, in_init_pose=False, init=None) if number in (None, k) else s
+            for k, s in enumerate(self._setup.subjects)
+        ]
+        self._setup = replace(self._setup, subjects=tuple(subjects))
 
     def _start(
         self, opening: Sequence[Observation], found: Sequence[LocatedPerson], numbers: Sequence[int], alone: bool
@@ -173,25 +187,33 @@ class People:
         """Start the trackers of the people found in the first frame. ``numbers``: of those chosen; ``alone``: the hulls
         show one person at most."""
         subjects = self._setup.subjects
+        self._given = set()
         if alone:
             self._tracked = [self._member(0, subjects[0], self._first)]
             try:
                 self._begin(self._tracked[0], opening, found[0].height_m if found else None)
+                self._given.add(0)
                 return
             except CaptureError:
                 if self._grid is None or not found or not self._several_in(opening):
                     raise
         people = [found[n] for n in numbers]
         known = matched(subjects[:1] if self._choice == "auto" else subjects, people, self._setup.up)
-        self._tracked = [self._member(0, known[0], self._first)]  # its kernels are compiled
-        self._tracked += [self._member(k, subject, self._make()) for k, subject in enumerate(known[1:], 1)]
-        rest = [person for n, person in enumerate(found) if n not in numbers and person.views.sum() >= 2]
-        shares = self._shares([*people, *rest], opening)
+        self._tracked = []
+        for k, subject in enumerate(known):
+            self._tracked.append(self._member(k, subject, self._new_tracker()))
+        rest = [n for n, person in enumerate(found) if n not in numbers and person.views.sum() >= 2]
+        shares = self._shares([*people, *(found[n] for n in rest)], opening)
         for member, frames, person in zip(self._tracked, shares, people, strict=False):
             self._begin(member, frames, person.height_m, opening)
-        for person, frames in zip(rest, shares[len(people) :], strict=True):
-            if person.inside:
-                self._admit(frames, person, unknown(subjects[0]), written=False)
+        self._given.update(numbers)
+        for n, frames in zip(rest, shares[len(people) :], strict=True):
+            if found[n].inside and self._admit(frames, found[n], unknown(subjects[0]), written=False):
+                self._given.add(n)
+
+    def _new_tracker(self) -> Tracker:
+        """Return a tracker that nobody has: the first, whose kernels are compiled, or another."""
+        return self._make() if self._tracked else self._first
 
     def _begin(
         self, member: Member, frames: Sequence[Observation], hull_m: float | None, whole: Sequence[Observation] = ()
@@ -249,11 +271,11 @@ class People:
     def step(self, frame: Observation) -> dict[int, Tracked]:
         """Return the answers of the people in the result who are tracked, by number.
 
-        Before the first person is tracked, a result of one person has the status absent, or lost if somebody is there.
+        Before that person is tracked, a result of one person has the status absent, or lost if the first person in the
+        volume could not be tracked.
         """
-        if not self._tracked:
-            nobody = replace(self._nobody, status="lost" if self._refused else "absent")
-            return {} if self.several else {0: Tracked(nobody, frame, frame)}
+        if not self._tracked and not self._awaited:
+            return self._nobody(frame, "lost" if self._refused else "absent")
         owners: PixelOwners | None = None
         if len(self._tracked) == 1 and not self._tracked[0].shows_others(frame.masks, self._setup.rig):
             (member,) = self._tracked
@@ -264,12 +286,12 @@ class People:
             without = np.empty((len(frame.masks), 0, 0, 3), np.uint8)  # images are views into the ring of frames
             self._unknown.append(replace(owners.unknown(frame), images=without))
         self._judge(answers)
-        self._look(frame, owners)
+        answers |= self._look(frame, owners)
         for member in self._tracked:
             if member.absent:
                 answer = answers[member.number]
                 answers[member.number] = replace(answer, estimate=replace(answer.estimate, status="absent"))
-        return {m.number: answers[m.number] for m in self.members if m.number in answers}
+        return {m.number: answers[m.number] for m in self.members} or self._nobody(frame, "absent")
 
     def _step_all(self, frame: Observation) -> tuple[dict[int, Tracked], PixelOwners]:
         """Return the answers of all members, and the owners of the pixels at the poses that were expected."""
@@ -313,26 +335,30 @@ class People:
 
     # --- who enters and leaves ----------------------------------------------------------------------------------------
 
-    def _look(self, frame: Observation, owners: PixelOwners | None) -> None:
-        """Find people who enter or leave. ``owners``: of the frame's pixels; None if the only person got all."""
+    def _look(self, frame: Observation, owners: PixelOwners | None) -> dict[int, Tracked]:
+        """Find people who enter or leave, and return the answers of those who enter.
+
+        ``owners``: of the frame's pixels; None if the only person got all.
+        """
         lost = [m for m in self._tracked if m.lost]
         for member in self._tracked:
             member.absent &= member.lost
         if self._grid is None or not (lost or (owners is not None and frame.index % self._every == 0)):
-            return
+            return {}
         owners = owners or self._owners(frame)
-        found = self._newcomers(frame, owners)
+        found, numbered = self._newcomers(frame, owners), self._choice == "all" or bool(self._awaited)
         for member in lost:
             if not found and member.has_left(frame.masks):
                 member.absent = True
-            elif found and self._choice != "all":
+            elif found and not numbered:
                 member.absent = False  # no newcomer is written: who appears may be this person, and the tracker looks
-        if frame.index % self._every == 0:  # who is not written, and lost, comes back as a newcomer
+        if frame.index % self._every == 0 and not numbered:  # who is not written, and lost, comes back as a newcomer
             self._tracked = [m for m in self._tracked if m.written or not m.lost]
         if any(m.lost and not m.absent for m in self._tracked) or len(self._unknown) < _HISTORY:
-            return
+            return {}
         if frame.index < self._admit_from:
-            return
+            return {}
+        answers: dict[int, Tracked] = {}
         for person in found:
             shares = self._shares([person], list(self._unknown)[::-1])[0]
             away = [m for m in self._tracked if m.absent]
@@ -340,11 +366,31 @@ class People:
             if alike and max(alike) > _SAME_COLORS:
                 away[int(np.argmax(alike))].absent = False  # the tracker finds this person in the unknown pixels
                 continue
-            newcomer = self._admit(shares, person, Subject(in_init_pose=False), written=self._choice == "all")
-            if newcomer is not None and newcomer.written:
-                self._note(f"frame {frame.index}: person {newcomer.number} has entered")
-            elif newcomer is not None:
+            assert self._given is not None
+            number = next(n for n in range(len(self._given) + 1) if n not in self._given)
+            written = self._choice == "all" or number in self._awaited
+            subject = self._subject_of(person) if written else Subject(in_init_pose=False)
+            newcomer = self._admit(shares, person, subject, written)
+            if newcomer is None:
+                continue
+            self._given.add(number)
+            answers[newcomer.number] = newcomer.step(replace(shares[0], images=frame.images))
+            if written:
+                self._note(f"frame {frame.index}: person {number} has entered")
+            else:
                 self._note(f"frame {frame.index}: another person is in view, at {person.where}")
+        return answers
+
+    def _subject_of(self, person: LocatedPerson) -> Subject:
+        """Return the subject of somebody who enters: the one who fits best of those that nobody has."""
+        subjects = self._setup.subjects
+        free = [s for s in subjects if all(s is not member.subject for member in self._tracked)]
+        if not free:
+            return Subject(in_init_pose=False)
+        (fits,) = matched(free, [person], self._setup.up)
+        number = next(k for k, s in enumerate(subjects) if s is fits)
+        self._begin_in_any_pose(number)
+        return self._setup.subjects[number]
 
     def _newcomers(self, frame: Observation, owners: PixelOwners) -> list[LocatedPerson]:
         """Return the people in the working volume whom the pixels show that no body explains."""
@@ -359,8 +405,10 @@ class People:
         self, frames: Sequence[Observation], person: LocatedPerson, subject: Subject, written: bool
     ) -> Member | None:
         """Add a person who is tracked from the first of some frames on; None if nobody can be tracked."""
-        number = 1 + max(m.number for m in self._tracked)
-        member = self._member(number, subject, self._make(), written)
+        # people who are not written have higher numbers than all who are, now and later
+        higher = len(self._choice) if isinstance(self._choice, tuple) else 1
+        number = len(self.members) if written else max([higher, *(1 + m.number for m in self._tracked)])
+        member = self._member(number, subject, self._new_tracker(), written)
         try:
             self._begin(member, frames, person.height_m)
         except CaptureError as reason:
@@ -377,9 +425,12 @@ class People:
         self._refused += 1
         self._admit_from = frame + self._every * min(2 ** (self._refused - 1), _LONGEST_PAUSE)
 
+    def _nobody(self, frame: Observation, status: str) -> dict[int, Tracked]:
+        """Return the answers in a frame before somebody who is in the result is tracked."""
+        return {} if self.several else {0: Tracked(replace(self._no_pose, status=status), frame, frame)}
+
     @cached_property
-    def _nobody(self) -> Estimate:
-        """The estimate for a frame before anybody is tracked."""
+    def _no_pose(self) -> Estimate:
         tracker, views = self._first, len(self._setup.rig)
         return Estimate(
             pose=np.full(len(tracker.pose_names), np.nan),
@@ -400,10 +451,11 @@ class People:
         return np.any([member.monitor.doubted for member in self.members], axis=0)
 
     def report(self) -> list[str]:
-        """Return lines on excluded cameras and losses, see :meth:`CameraMonitor.report`."""
+        """Return lines on excluded cameras and losses, see :meth:`CameraMonitor.report`, and on who did not come."""
+        missing = [_not_entered(number) for number in sorted(self._awaited)]
         if len(self.members) == 1:
-            return self.members[0].monitor.report()
-        return [f"person {m.number}: {line}" for m in self.members for line in m.monitor.report()]
+            return [*self.members[0].monitor.report(), *missing]
+        return [*(f"person {m.number}: {line}" for m in self.members for line in m.monitor.report()), *missing]
 
     def state(self) -> dict[str, Any]:
         """Return what :meth:`restore` needs beside the bodies. Person 0's entries have no prefix."""
@@ -411,10 +463,12 @@ class People:
         for k, member in enumerate(self._tracked):
             prefix = f"{_PEOPLE}{k}/" if k else ""
             number = next((k for k, known in enumerate(self._setup.subjects) if known is member.subject), -1)
-            own = {**member.state(), _SUBJECT: number, _IN_INIT_POSE: member.subject.in_init_pose}
+            known = {_SUBJECT: number, _IN_INIT_POSE: member.subject.in_init_pose, _NUMBER: member.number}
+            own = {**member.state(), **known}
             state |= {prefix + name: value for name, value in own.items()}
             if not member.written:
                 state |= {f"{prefix}{_MODEL}{name}": value for name, value in member.tracker.model().items()}
+        state[_GIVEN] = np.array(sorted(self._given or ()), np.int64)
         return state | {_CONTACTS + name: value for name, value in self._contacts.state().items()}
 
     def restore(self, models: Sequence[Mapping[str, Any]], state: Mapping[str, Any]) -> None:
@@ -428,12 +482,17 @@ class People:
         while own := below(f"{_PEOPLE}{k}/", state) if k else state:
             subject, in_init_pose = int(own[_SUBJECT]), bool(own[_IN_INIT_POSE])
             if subject >= 0 and self._setup.subjects[subject].in_init_pose and not in_init_pose:
-                self._begin_in_any_pose()
+                self._begin_in_any_pose(subject)
             known = self._setup.subjects[subject] if subject >= 0 else Subject(in_init_pose=in_init_pose)
-            tracker = self._make() if k else self._first
-            member = self._member(k, known, tracker, written=k < len(models))
+            tracker, number = self._make() if k else self._first, int(own[_NUMBER])
+            member = self._member(number, known, tracker, written=number < len(models))
             self._tracked[k:] = [member]
-            tracker.restore(models[k] if member.written else below(_MODEL, own), own)
+            tracker.restore(models[number] if member.written else below(_MODEL, own), own)
             member.restore(own)
             k += 1
+        self._given = {int(number) for number in state[_GIVEN]}
         self._contacts.restore(below(_CONTACTS, state))
+
+
+def _not_entered(number: int) -> str:
+    return f"person {number} did not enter the working volume"
