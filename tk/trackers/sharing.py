@@ -73,14 +73,14 @@ class PixelOwners:
         own = self.owner == person
         if unknown:
             own |= self.owner == NOBODY
-        masks[(masks >= PERSON) & ~own] = OTHERS
+        np.putmask(masks, (masks >= PERSON) & ~own, OTHERS)
         return replace(frame, masks=masks)
 
     def unknown(self, frame: Observation) -> Observation:
         """Return the observation of people who are unknown; pixels of known people are
         :data:`~tk.kernels.mask_values.OTHERS`."""
         masks = frame.masks.copy()
-        masks[(masks >= PERSON) & (self.owner != NOBODY)] = OTHERS
+        np.putmask(masks, (masks >= PERSON) & (self.owner != NOBODY), OTHERS)
         return replace(frame, masks=masks)
 
     def areas(self, masks: NDArray[np.uint8]) -> NDArray[np.int64]:
