@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import functools
 import io
 import json
 import signal
@@ -11,7 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -22,7 +21,7 @@ from tk.commands.console import ConsoleReporter
 from tk.errors import ConfigError, TkError
 
 if TYPE_CHECKING:
-    from tk.run.task import RecordingOptions
+    from tk.run.task import Choice, RecordingOptions
     from tk.settings import Settings
 
 
@@ -145,6 +144,13 @@ def _span(ctx: click.Context, option: click.Parameter, frames: str | None) -> Sp
     return start, stop
 
 
+def _people(ctx: click.Context, option: click.Parameter, people: str) -> Choice:
+    """Return who is tracked."""
+    from tk.run.task import parse_choice
+
+    return parse_choice(people)
+
+
 PATH = click.Path(path_type=Path)
 
 capture_argument = click.argument("capture", type=PATH)
@@ -171,48 +177,6 @@ quiet_option = click.option("-q", "--quiet", is_flag=True, help="Show no progres
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the results as JSON on stdout.")
 
 
-@dataclass(frozen=True)
-class GivenOptions:
-    """The options that `tk track` and `tk batch` share, as given on the command line."""
-
-    method: str
-    voxels: int | None
-    cameras: Names
-    frames: Span
-    seed: int | None
-    masks: str
-    body: Path | None
-    people: str
-    causal: bool
-    store_hull: bool
-    resample: bool | None
-    preset: str | None
-    config_file: Path | None
-
-    def options(self) -> RecordingOptions:
-        """Return them with the settings that they describe.
-
-        Raises:
-            ConfigError: the settings cannot be read, or the people are not described correctly.
-        """
-        from tk.run.task import RecordingOptions, parse_choice
-
-        settings = load_settings(
-            self.config_file, self.preset, voxels=self.voxels, seed=self.seed, resample=self.resample
-        )
-        return RecordingOptions(
-            settings=settings,
-            method=self.method,
-            frames=self.frames,
-            people=parse_choice(self.people),
-            causal=self.causal,
-            store_hull=self.store_hull,
-            cameras=self.cameras,
-            masks=self.masks,
-            body=self.body,
-        )
-
-
 _TRACKING_OPTIONS = (
     click.option(
         "--method", default="region", show_default=True,
@@ -226,7 +190,7 @@ _TRACKING_OPTIONS = (
     masks_option,
     click.option("--body", type=PATH, metavar="FILE", help="Use the body of a result (.h5) or of a TOML file."),
     click.option(
-        "--people", default="auto", show_default=True, metavar="auto|all|N,M",
+        "--people", default="auto", show_default=True, metavar="auto|all|N,M", callback=_people,
         help="Whom to track: auto: one person; all: everybody; N,M: by the numbers of tk inspect.",
     ),
     click.option("--causal", is_flag=True, help="Run the first pass only: no frame depends on later frames."),
@@ -238,16 +202,31 @@ _TRACKING_OPTIONS = (
 
 
 def tracking_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of :class:`GivenOptions` to a command, which receives them as ``given``."""
-    names = [field.name for field in fields(GivenOptions)]
-
-    @functools.wraps(command)
-    def grouped(**options: Any) -> None:
-        command(given=GivenOptions(**{name: options.pop(name) for name in names}), **options)
-
+    """Add the options that `tk track` and `tk batch` share to a command, which gives them to
+    :func:`recording_options`."""
     for option in reversed(_TRACKING_OPTIONS):
-        grouped = option(grouped)
-    return grouped
+        command = option(command)
+    return command
+
+
+def recording_options(
+    config_file: Path | None,
+    preset: str | None,
+    voxels: int | None,
+    seed: int | None,
+    resample: bool | None,
+    **others: Any,
+) -> RecordingOptions:
+    """Return the options of a run as given on the command line; those that are not settings have the names of
+    :class:`tk.run.task.RecordingOptions`.
+
+    Raises:
+        ConfigError: the settings cannot be read.
+    """
+    from tk.run.task import RecordingOptions
+
+    settings = load_settings(config_file, preset, voxels=voxels, seed=seed, resample=resample)
+    return RecordingOptions(settings, **others)
 
 
 def load_settings(file: Path | None, preset: str | None = None, **overrides: Any) -> Settings:

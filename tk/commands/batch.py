@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -29,14 +30,14 @@ def batch(
     workers: int | None,
     scheduler: str | None,
     dashboard: bool,
-    given: base.GivenOptions,
     no_report: bool,
     quiet: bool,
+    **given: Any,
 ) -> None:
     """Track many captures into FOLDER and write a summary; after an interruption, the same command continues."""
     from tk.batch import exit_code, run_batch
 
-    options = given.options()
+    options = base.recording_options(**given)
     options = replace(options, body=options.body and options.body.resolve())  # workers may run in other folders
     with BatchConsoleReporter(quiet) as reporter:
         try:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -46,25 +45,25 @@ WARN_SHARE = 0.2
 def track(
     capture: Path,
     output: Path,
-    given: base.GivenOptions,
-    init_pose: Path | None,
     resume: bool,
     force: bool,
     no_report: bool,
     quiet: bool,
     as_json: bool,
+    causal: bool,
+    **given: Any,
 ) -> None:
     """Track the person or the people in CAPTURE and write the pose of every frame to RESULT.h5.
 
     An overlay video (RESULT.mp4) and a report (RESULT.html) are written next to it.
     """
-    reporter = ConsoleReporter(quiet, None, *later_stages(given.causal, no_report), "loading")
+    reporter = ConsoleReporter(quiet, None, *later_stages(causal, no_report), "loading")
     with reporter, started_early():
         from tk.io.importers import open_recording
         from tk.io.results.files import check_result_path
         from tk.run import session
 
-        options = replace(given.options(), init_pose=init_pose)
+        options = base.recording_options(causal=causal, **given)
         if options.settings.ahead == 0:
             dismiss()
         check_result_path(output, force, resume)
