@@ -31,7 +31,8 @@ from tk.model.cameras.bundle import TrackedPoses
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.refinement import turn_between
 from tk.run import offline as finish
-from tk.run.refinement import refine_capture, retimed, whole_delays
+from tk.run.delays import retimed, whole_delays
+from tk.run.refined_calibration import refine_capture
 from tk.settings import Settings
 from tk.trackers.region import UNKNOWN_AFTER
 

@@ -32,7 +32,7 @@ from tk.model.masks.image_shift import ImageShift
 from tk.model.masks.mask_agreement import INCONSISTENT, Agreement, MaskAgreement
 from tk.model.masks.regions import clean_by_area
 from tk.model.masks.silhouettes import HOLE_SHARE
-from tk.run.refinement import LARGEST_DELAY
+from tk.run.delays import LARGEST_DELAY
 from tk.run.segmentation import make_labeller
 from tk.run.task import Task
 from tk.settings import Settings

@@ -22,11 +22,12 @@ from tk.model.cameras.bundle import TrackedPoses
 from tk.model.masks.image_health import described
 from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
+from tk.run.delays import retimed
 from tk.run.identity import COLUMNS, EXCHANGED, UNCLEAR, doubtful, exchange_masks, exchanged, report
 from tk.run.member import Member
 from tk.run.people import People
 from tk.run.prefetch import open_observations
-from tk.run.refinement import compare_cameras, refine_if_inconsistent, retimed
+from tk.run.refinement import compare_cameras, refine_if_inconsistent
 from tk.run.task import Task
 from tk.trackers.protocol import Estimate, Observation, TwoPassTracker, two_pass
 from tk.trackers.region import UNKNOWN_AFTER

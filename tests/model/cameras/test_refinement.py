@@ -229,8 +229,8 @@ def test_delays_of_videos_are_estimated(late):
     store = rendered(late)
     done = refine_rig(BODY, RIG, store, tracked(), QUICK)
     assert done is not None
-    np.testing.assert_allclose(done.refined.offset_frames, late, atol=0.12)
-    assert (done.refined.offset_sigma_frames < 0.2).all()
+    np.testing.assert_allclose(done.offset_frames, late, atol=0.12)
+    assert (done.offset_sigma_frames < 0.2).all()
 
 
 def test_too_few_usable_frames_give_none():

@@ -79,6 +79,7 @@ class Refined:
     before_px: Float
     after_px: Float
     converged: bool  # whether the last steps were small
+    frame_count: int  # number of frames used
 
 
 def refine_cameras(
@@ -129,6 +130,7 @@ def refine_cameras(
         before_px=residual_px(bundle.contours(bundle.start, 0), C) * rig.reductions,
         after_px=residual_px(bundle.contours(final, 0), C) * rig.reductions,
         converged=solution.converged,
+        frame_count=len(frames),
     )
 
 
