@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from scripts.synthetic.skeleton import LIMITS_DEG, Angles, Skeleton, forward, sole_points
+from scripts.synthetic.skeleton import LIMITS_DEG, Angles, Skeleton, forward, sole_of
 
 Float = NDArray[np.float64]
 
@@ -29,10 +29,11 @@ def arm_angles(
     names = [name + side for name in _NAMES]
     start = np.array([guess.get(name, 0.0) for name in _NAMES])
     limits = np.array([LIMITS_DEG[name] for name in names], dtype=np.float64)
-    chest, wrist = skeleton.index("chest"), skeleton.index("wrist" + side)
+    arm = skeleton.branch("wrist" + side)
+    chest, wrist = arm.index("chest"), arm.index("wrist" + side)
 
     def residual(degrees: np.ndarray) -> np.ndarray:
-        pose = forward(skeleton, {name: np.radians([value]) for name, value in zip(names, degrees, strict=True)})
+        pose = forward(arm, {name: np.radians([value]) for name, value in zip(names, degrees, strict=True)})
         miss = pose.origin[0, wrist] - pose.origin[0, chest] - np.array(wrist_m)
         return np.concatenate([miss / 0.005, (degrees - start) / 100.0])
 
@@ -58,16 +59,17 @@ def leg_angles(skeleton: Skeleton, side: str, angles: Angles, root: Float, toe: 
     """
     names = [name + side for name in _LEG_NAMES]
     low, high = np.radians([LIMITS_DEG[name] for name in names]).T
-    foot, ankle = ("_l", "_r").index(side), skeleton.index("ankle" + side)
+    leg = skeleton.branch("toes" + side)
+    ankle = leg.index("ankle" + side)
     ahead = np.stack([np.cos(heading), np.sin(heading), np.zeros_like(heading)], axis=1)
     given = {name: angles[name] for name in ("yaw", "pitch", "roll", "ankle" + side)}
 
     def residual(x: Float, at: int) -> Float:
         rows = np.full(len(x), at)
         legs = {name: x[:, i] for i, name in enumerate(names)}
-        pose = forward(skeleton, {name: values[rows] for name, values in given.items()} | legs, root[rows])
+        pose = forward(leg, {name: values[rows] for name, values in given.items()} | legs, root[rows])
         sideways = (pose.rotation[:, ankle, :, 1] * ahead[at]).sum(axis=1)
-        return np.column_stack([sole_points(skeleton, pose)[:, foot, 2] - toe[at], 0.2 * sideways, _LEG_WEIGHT * x])
+        return np.column_stack([sole_of(leg, pose, side)[:, 2] - toe[at], 0.2 * sideways, _LEG_WEIGHT * x])
 
     step, solved = 1e-5, np.empty((len(toe), len(names)))
     probes = np.concatenate([np.zeros((1, len(names))), step * np.eye(len(names))])

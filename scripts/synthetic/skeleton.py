@@ -71,6 +71,14 @@ class Skeleton:
     def index(self, name: str) -> int:
         return self.names.index(name)
 
+    def branch(self, name: str) -> Skeleton:
+        """Return the tree of a bone and of those that carry it."""
+        bones = [self.index(name)]
+        while self.parents[bones[0]] >= 0:
+            bones.insert(0, self.parents[bones[0]])
+        names = tuple(self.names[j] for j in bones)
+        return Skeleton(self.stature_m, names, tuple(range(-1, len(bones) - 1)), self.offsets[bones])
+
 
 @dataclass(frozen=True)
 class Pose:
@@ -153,7 +161,7 @@ def forward(skeleton: Skeleton, angles: Angles, root: Float | None = None) -> Po
     needs angles of its own; `ankle` is an offset from level (negative points the toes).
 
     Args:
-        skeleton: the tree.
+        skeleton: the tree, or a branch of it.
         angles: any of :data:`LIMITS_DEG`, (T,) radians each; angles left out are zero.
         root: (T, 3) position of the pelvis, metres; the origin by default.
     """
@@ -164,30 +172,33 @@ def forward(skeleton: Skeleton, angles: Angles, root: Float | None = None) -> Po
         return np.asarray(angles.get(name, zero), dtype=np.float64)
 
     local: dict[str, Float] = {"pelvis": rot_z(get("yaw")) @ rot_y(get("pitch")) @ rot_x(get("roll"))}
-    for bone, share in (("lumbar", 0.35), ("thorax", 0.35), ("chest", 0.3)):
-        local[bone] = (
-            rot_z(share * get("spine_turn")) @ rot_y(share * get("spine_flex")) @ rot_x(share * get("spine_side"))
-        )
-    for bone in ("neck", "head"):
-        local[bone] = rot_z(get("neck_turn") / 2) @ rot_y(get("neck_flex") / 2) @ rot_x(get("neck_side") / 2)
+    if "chest" in skeleton.names:
+        for bone, share in (("lumbar", 0.35), ("thorax", 0.35), ("chest", 0.3)):
+            local[bone] = (
+                rot_z(share * get("spine_turn")) @ rot_y(share * get("spine_flex")) @ rot_x(share * get("spine_side"))
+            )
+        for bone in ("neck", "head"):
+            local[bone] = rot_z(get("neck_turn") / 2) @ rot_y(get("neck_flex") / 2) @ rot_x(get("neck_side") / 2)
     for side, s in SIDES:
-        abd, flex = get("shoulder_abd" + side), get("shoulder_flex" + side)
-        # scapulohumeral rhythm, much simplified: the girdle rises and protracts by a fraction of the arm's angle
-        rise = 0.12 * np.maximum(abd, 0) + 0.05 * np.maximum(flex, 0)
-        girdle = rot_z(-s * 0.12 * flex) @ rot_x(s * rise)
-        local["clavicle" + side] = girdle
-        upper = rot_x(s * abd) @ rot_y(-flex) @ rot_z(-s * get("shoulder_in" + side))
-        local["shoulder" + side] = np.swapaxes(girdle, 1, 2) @ upper  # angles are relative to the chest
-        local["elbow" + side] = rot_y(-get("elbow" + side))
-        local["wrist" + side] = rot_z(-s * get("pronate" + side)) @ rot_x(-s * get("wrist_flex" + side))
-        local["knuckles" + side] = local["fingertips" + side] = rot_x(-s * get("fingers" + side))
-        local["hip" + side] = (
-            rot_z(s * get("hip_open" + side))
-            @ rot_x(s * get("hip_abd" + side))
-            @ rot_y(-get("hip_flex" + side))
-            @ rot_z(-s * get("hip_in" + side))
-        )
-        local["knee" + side] = rot_y(get("knee" + side))
+        if "clavicle" + side in skeleton.names:
+            abd, flex = get("shoulder_abd" + side), get("shoulder_flex" + side)
+            # scapulohumeral rhythm, much simplified: the girdle rises and protracts by a fraction of the arm's angle
+            rise = 0.12 * np.maximum(abd, 0) + 0.05 * np.maximum(flex, 0)
+            girdle = rot_z(-s * 0.12 * flex) @ rot_x(s * rise)
+            local["clavicle" + side] = girdle
+            upper = rot_x(s * abd) @ rot_y(-flex) @ rot_z(-s * get("shoulder_in" + side))
+            local["shoulder" + side] = np.swapaxes(girdle, 1, 2) @ upper  # angles are relative to the chest
+            local["elbow" + side] = rot_y(-get("elbow" + side))
+            local["wrist" + side] = rot_z(-s * get("pronate" + side)) @ rot_x(-s * get("wrist_flex" + side))
+            local["knuckles" + side] = local["fingertips" + side] = rot_x(-s * get("fingers" + side))
+        if "hip" + side in skeleton.names:
+            local["hip" + side] = (
+                rot_z(s * get("hip_open" + side))
+                @ rot_x(s * get("hip_abd" + side))
+                @ rot_y(-get("hip_flex" + side))
+                @ rot_z(-s * get("hip_in" + side))
+            )
+            local["knee" + side] = rot_y(get("knee" + side))
 
     rotation = np.empty((count, len(skeleton.names), 3, 3))
     origin = np.empty((count, len(skeleton.names), 3))
@@ -223,16 +234,17 @@ def joint_positions(skeleton: Skeleton, pose: Pose) -> Float:
 
 def sole_points(skeleton: Skeleton, pose: Pose) -> Float:
     """(T, 2, 3, 3) heel, ball and toe tip of the left and the right sole, world, metres."""
+    return np.stack([sole_of(skeleton, pose, side) for side, _ in SIDES], axis=1)
+
+
+def sole_of(skeleton: Skeleton, pose: Pose, side: str) -> Float:
+    """(T, 3, 3) heel, ball and toe tip of one sole, world, metres."""
     height = -skeleton.stature_m * 0.039 - SOLE_M
     toe_z = height + 0.026 * skeleton.stature_m
-    sides = []
-    for side, _ in SIDES:
-        ankle, toes = skeleton.index("ankle" + side), skeleton.index("toes" + side)
-        sides.append(
-            [
-                pose.point(ankle, np.array([-0.05, 0, height])),
-                pose.point(ankle, np.array([0.11, 0, height])),
-                pose.point(toes, np.array([0.06, 0, toe_z])),
-            ]
-        )
-    return np.moveaxis(np.array(sides), 2, 0)
+    ankle, toes = skeleton.index("ankle" + side), skeleton.index("toes" + side)
+    points = [
+        pose.point(ankle, np.array([-0.05, 0, height])),
+        pose.point(ankle, np.array([0.11, 0, height])),
+        pose.point(toes, np.array([0.06, 0, toe_z])),
+    ]
+    return np.stack(points, axis=1)
