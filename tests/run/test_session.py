@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 import tomli_w
 
-from scripts.synthetic.capture import Options, plan_capture, write_capture
 from tests import conftest
 from tests.conftest import FRAMES, QUICK, Silent, Tk
 from tests.io.conftest import write_picture
@@ -142,23 +141,10 @@ def test_frames_are_reported_after_they_are_written(
     assert_same(result, tracked)
 
 
-def test_a_killed_run_leaves_every_reported_frame(tiny: Path, tracked: Path, tmp_path: Path) -> None:
-    """With frames that are written together, as many as it may be."""
-    result, settings = tmp_path / "r.h5", tmp_path / "s.toml"
-    settings.write_text(QUICK, encoding="utf-8")
-    command = ["track", tiny, "-o", result, "--method", "volumetric", "--config", settings]
-    killed = send(signal.SIGKILL, 5, *command, write_every_s=0.05)
-    assert killed.returncode == -signal.SIGKILL, killed.stderr
-    done = len(read_result(result).frames)
-    assert 6 <= done < FRAMES
-    assert_same(result, tracked, slice(0, done))
-
-
-@pytest.mark.parametrize("frames", [(0, 1), (0, 6)])
-def test_a_run_can_be_extended(tiny: Path, tracked: Path, tmp_path: Path, frames: tuple[int, int]) -> None:
+def test_a_run_can_be_extended(tiny: Path, tracked: Path, tmp_path: Path) -> None:
     """The body is fitted to the same frames however few are asked for."""
-    run(tiny, tmp_path / "r.h5", frames=frames, store_hull=True)
-    assert_same(tmp_path / "r.h5", tracked, slice(*frames))
+    run(tiny, tmp_path / "r.h5", frames=(0, 1), store_hull=True)
+    assert_same(tmp_path / "r.h5", tracked, slice(0, 1))
     run(tiny, tmp_path / "r.h5", resume=True, store_hull=True)
     assert_same(tmp_path / "r.h5", tracked)
 
@@ -196,9 +182,8 @@ def test_only_the_same_command_is_resumed(
     assert begun.read_bytes() == before
 
 
-def test_large_images_are_reduced_and_the_result_has_the_recorded_cameras(tmp_path: Path) -> None:
-    write_capture(plan_capture(Options(frames=2, cameras=4, size=(320, 240), seed=3)), tmp_path / "capture", masks=True)
-    capture, half = open_capture(tmp_path / "capture"), tmp_path / "half.h5"
+def test_large_images_are_reduced_and_the_result_has_the_recorded_cameras(tiny: Path, tmp_path: Path) -> None:
+    capture, half = open_capture(tiny), tmp_path / "half.h5"
     tall = capture.setup().person_pixels()
     config = replace(CONFIG, person_pixels=int(tall.min() / 2))
     reporter = Silent()
@@ -357,9 +342,7 @@ def test_requested_frames_are_tracked(tiny: Path) -> None:
     assert choose_frames(late, (0, 6), notes.append) == (5, 6)
 
 
-@pytest.mark.parametrize(
-    ("method", "segmentation"), [("region", "collinearity"), ("silhouette", "collinearity"), ("volumetric", "mog2")]
-)
+@pytest.mark.parametrize(("method", "segmentation"), [("region", "collinearity"), ("volumetric", "mog2")])
 def test_masks_are_made_from_the_videos(tiny: Path, tmp_path: Path, method: str, segmentation: str) -> None:
     config, path = settings_file.from_toml(f'segmentation = "{segmentation}"\n{QUICK}'), tmp_path / "r.h5"
     capture = open_capture(tiny, masks="none")

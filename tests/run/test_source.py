@@ -197,63 +197,61 @@ def test_silhouettes_of_the_pair_overlap() -> None:
     assert np.count_nonzero((MASKS[0] & MASKS[1]).any(axis=(0, 2, 3))) >= 2
 
 
-def test_two_people_are_tracked_and_a_resumed_run_is_the_same(tmp_path: Path) -> None:
-    source, path = Rendered(MASKS.max(axis=0)), tmp_path / "r.h5"
-    track_task(task(PAIR, source, people="all", causal=True), path, Silent())
-    whole = read_result(path).people
-    assert len(whole) == 2
-    assert sorted(person for r in whole for person in (0, 1) if far_off(r.joints, person) < 0.03) == [0, 1]
-    assert not any((r.status == Status.LOST).any() for r in whole)
-    part = tmp_path / "part.h5"
-    for stop, resume in ((3, False), (None, True)):
-        track_task(task(PAIR, source, frames=(0, stop), people="all", causal=True), part, Silent(), resume=resume)
-    for a, b in zip(read_result(part).people, whole, strict=True):
-        np.testing.assert_array_equal(a.pose, b.pose)
-        np.testing.assert_array_equal(a.status, b.status)
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, ...]:
+    """Both people, tracked in one go."""
+    path = tmp_path_factory.mktemp("pair") / "r.h5"
+    track_task(task(PAIR, Rendered(MASKS.max(axis=0)), people="all"), path, Silent())
+    return read_result(path).people
 
 
-def test_a_bystander_is_no_part_of_the_subject() -> None:
-    notes: list[str] = []
-    for person in (0, 1):
-        found = list(
-            estimates(task(PAIR, Rendered(MASKS.max(axis=0)), frames=(0, COUNT), people=(person,)), notes.append)
-        )
-        assert {e.person for e in found} == {0} and "lost" not in {e.status for e in found}
-        joints = np.array([e.joints for e in found])
-        assert min(far_off(joints, who) for who in (0, 1)) < 0.04
-    assert not notes
-    list(estimates(task(PAIR, Rendered(MASKS.max(axis=0)), frames=(0, 1)), notes.append))
-    assert any("2 people are in view" in note for note in notes)
+def test_two_people_are_tracked_and_kept_apart(pair: tuple[Result, ...]) -> None:
+    assert len(pair) == 2
+    assert sorted(person for r in pair for person in (0, 1) if far_off(r.joints, person) < 0.03) == [0, 1]
+    assert not any((r.status == Status.LOST).any() for r in pair)
 
 
-def test_the_second_pass_keeps_two_people_apart(tmp_path: Path) -> None:
-    track_task(task(PAIR, Rendered(MASKS.max(axis=0)), people="all"), tmp_path / "r.h5", Silent())
-    found = read_result(tmp_path / "r.h5").people
-    assert sorted(person for r in found for person in (0, 1) if far_off(r.joints, person) < 0.03) == [0, 1]
-
-
-def test_a_run_stopped_between_two_people_s_second_passes_is_finished(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_run_stopped_among_the_frames_and_between_two_people_s_second_passes_is_finished(
+    pair: tuple[Result, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def track(name: str, resume: bool = False) -> Path:
-        path = tmp_path / name
-        source, span = Rendered(MASKS.max(axis=0)), (0, COUNT)
-        track_task(task(PAIR, source, frames=span, people="all"), path, Silent(), resume=resume)
-        return path
+    class Stop(Silent):
+        def advance(self, frame: int, estimate: object) -> None:
+            if frame == 2:
+                raise KeyboardInterrupt
 
     def stop_at_person_1(finisher: Any, member: Member, *rest: Any) -> None:
         if member.number == 1:
             raise KeyboardInterrupt
         finish_one(finisher, member, *rest)
 
-    whole, finish_one = read_result(track("whole.h5")).people, offline._Finisher.finish
+    def track(reporter: Silent, resume: bool = True) -> tuple[Result, ...]:
+        run = task(PAIR, Rendered(MASKS.max(axis=0)), frames=(0, COUNT), people="all")
+        track_task(run, tmp_path / "r.h5", reporter, resume=resume)
+        return read_result(tmp_path / "r.h5").people
+
+    monkeypatch.setattr(loop, "WRITE_EVERY_S", 0)
+    finish_one = offline._Finisher.finish
+    assert len(track(Stop(), resume=False)[0].frames) < COUNT
     with monkeypatch.context() as patch:
         patch.setattr(offline._Finisher, "finish", stop_at_person_1)
-        stopped = read_result(track("r.h5")).people
+        stopped = track(Silent())
     assert stopped[0].smoothed is not None and stopped[1].smoothed is None
-    for a, b in zip(read_result(track("r.h5", resume=True)).people, whole, strict=True):
+    np.testing.assert_array_equal(stopped[0].pose, pair[0].pose)
+    for a, b in zip(track(Silent()), pair, strict=True):
         np.testing.assert_allclose(a.pose, b.pose, atol=1e-9)  # the file has rounded rotations of the cameras
+        np.testing.assert_array_equal(a.status, b.status)
         assert a.smoothed is not None
+
+
+def test_a_bystander_is_no_part_of_the_subject() -> None:
+    notes: list[str] = []
+    found = list(estimates(task(PAIR, Rendered(MASKS.max(axis=0)), frames=(0, COUNT), people=(0,)), notes.append))
+    assert {e.person for e in found} == {0} and "lost" not in {e.status for e in found}
+    joints = np.array([e.joints for e in found])
+    assert min(far_off(joints, who) for who in (0, 1)) < 0.04
+    assert not notes
+    list(estimates(task(PAIR, Rendered(MASKS.max(axis=0)), frames=(0, 1)), notes.append))
+    assert any("2 people are in view" in note for note in notes)
 
 
 def test_the_subject_position_chooses_the_person() -> None:
@@ -266,7 +264,7 @@ def test_the_subject_position_chooses_the_person() -> None:
 def test_a_number_that_nobody_gets_is_an_error_or_a_note(tmp_path: Path) -> None:
     source = Rendered(MASKS.max(axis=0))
     with refused(CaptureError, "person 2 did not enter the working volume"):
-        track_task(task(PAIR, source, people=(2,)), tmp_path / "r.h5", Silent())
+        track_task(task(PAIR, source, people=(2,), frames=(0, 1)), tmp_path / "r.h5", Silent())
     assert not list(tmp_path.iterdir())
     reporter = Silent()
     track_task(task(PAIR, source, people=(2, 1), causal=True), tmp_path / "r.h5", reporter)
@@ -278,66 +276,79 @@ def test_a_number_that_nobody_gets_is_an_error_or_a_note(tmp_path: Path) -> None
     ]
 
 
+ENTERING = 19  # frames; person 1 is there in frames 3 to 16
+ENTER = np.array([walk(ENTERING), walk(ENTERING, first=0.4)])
+ENTER[:, :, :2] += [[[0.35, -0.05]], [[-0.35, 0.05]]]
+
+
 def track_entering(
-    path: Path, count: int, people: Choice = "all", stop: int | None = None, resume: bool = False
-) -> tuple[np.ndarray, tuple[Result, ...]]:
-    """Return the poses and the results of two people; person 1 is there in frames 3 to 16."""
-    poses = np.array([walk(count), walk(count, first=0.4)])
-    poses[:, :, :2] += [[[0.35, -0.05]], [[-0.35, 0.05]]]
-    masks = np.array([draw_silhouettes(BODY, FOUR, own) for own in poses])
+    path: Path, people: Choice = "all", stop: int | None = None, resume: bool = False
+) -> tuple[Result, ...]:
+    """Return the results of two people of whom one enters and leaves."""
+    masks = np.array([draw_silhouettes(BODY, FOUR, own) for own in ENTER])
     masks[1, :3] = masks[1, 17:] = 0
     setup = replace(PAIR, fps=4.0, subjects=PAIR.subjects[:1])
     run = task(setup, Rendered(masks.max(axis=0)), people=people, causal=True, frames=(0, stop))
     track_task(run, path, Silent(), resume=resume)
-    return poses, read_result(path).people
+    return read_result(path).people
 
 
-def test_somebody_who_enters_gets_a_number_and_who_leaves_is_absent(tmp_path: Path) -> None:
-    count = 22
-    poses, (first, second) = track_entering(tmp_path / "r.h5", count)
-    np.testing.assert_array_equal(first.frames, np.arange(count))
-    assert not (first.status == Status.LOST).any()
-    np.testing.assert_array_equal(second.frames, np.arange(second.frames[0], 17))
-    assert 3 < second.frames[0] < 16 and not (second.status == Status.LOST).any()
-    for own, result in zip(poses, (first, second), strict=True):
-        joints = np.array([BODY.skeleton.joints(pose) for pose in own[result.frames]])
-        assert np.median(np.linalg.norm(result.joints - joints, axis=2)) < 0.1  # coarse settings
+@pytest.fixture(scope="module")
+def everybody(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, ...]:
+    """Both people."""
+    return track_entering(tmp_path_factory.mktemp("entering") / "r.h5")
 
 
-def test_somebody_who_enters_later_can_be_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="module")
+def second(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, tuple[Subject, ...]]:
+    """The person who enters, chosen by number, and the subjects whose trackers were started."""
     begin, subjects = People._begin, []
 
     def watch(people: People, member: Member, *rest: Any) -> None:
         subjects.append(member.subject)
         begin(people, member, *rest)
 
-    monkeypatch.setattr(People, "_begin", watch)
-    count = 19
-    poses, (found,) = track_entering(tmp_path / "r.h5", count, (1,))
-    np.testing.assert_array_equal(found.frames, np.arange(count))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(People, "_begin", watch)
+        (found,) = track_entering(tmp_path_factory.mktemp("entering") / "r.h5", (1,))
+    return found, tuple(subjects)
+
+
+def test_somebody_who_enters_gets_a_number_and_who_leaves_is_absent(everybody: tuple[Result, ...]) -> None:
+    first, second = everybody
+    np.testing.assert_array_equal(first.frames, np.arange(ENTERING))
+    assert not (first.status == Status.LOST).any()
+    np.testing.assert_array_equal(second.frames, np.arange(second.frames[0], 17))
+    assert 3 < second.frames[0] < 16 and not (second.status == Status.LOST).any()
+    for own, result in zip(ENTER, (first, second), strict=True):
+        joints = np.array([BODY.skeleton.joints(pose) for pose in own[result.frames]])
+        assert np.median(np.linalg.norm(result.joints - joints, axis=2)) < 0.1  # coarse settings
+
+
+def test_somebody_who_enters_later_can_be_chosen(second: tuple[Result, tuple[Subject, ...]]) -> None:
+    found, subjects = second
+    np.testing.assert_array_equal(found.frames, np.arange(ENTERING))
     (here,) = np.nonzero(found.status != Status.ABSENT)
     assert 3 < here[0] < 16 and not (found.status == Status.LOST).any() and np.isfinite(found.pose).all()
     np.testing.assert_array_equal(here, np.arange(here[0], 17))
-    joints = np.array([BODY.skeleton.joints(pose) for pose in poses[1][here]])
+    joints = np.array([BODY.skeleton.joints(pose) for pose in ENTER[1][here]])
     assert np.median(np.linalg.norm(found.joints[here] - joints, axis=2)) < 0.1  # coarse settings
     assert [subject.body for subject in subjects] == [None, BODY]  # the subject is the one who is chosen
 
 
 @pytest.mark.parametrize("people", [(1,), (1, 0)])
-def test_a_run_with_somebody_who_enters_later_is_resumed(tmp_path: Path, people: Choice) -> None:
-    count = 17
-    _, whole = track_entering(tmp_path / "whole.h5", count, people)
-    if len(people) > 1:  # in the order in which they came
-        _, expected = track_entering(tmp_path / "all.h5", count, "all")
-        for one, other in zip(whole, expected, strict=True):
-            np.testing.assert_array_equal(one.pose, other.pose)
-    for stop, resume in ((3, False), (14, True), (None, True)):  # before and after the person enters
-        if stop == 3 and len(people) == 1:
-            with refused(CaptureError, "person 1 did not enter"):
-                track_entering(tmp_path / "part.h5", count, people, stop, resume)
-        else:
-            track_entering(tmp_path / "part.h5", count, people, stop, resume)
-    for one, other in zip(read_result(tmp_path / "part.h5").people, whole, strict=True):
+def test_a_run_with_somebody_who_enters_later_is_resumed(
+    second: tuple[Result, Any], everybody: tuple[Result, ...], tmp_path: Path, people: Choice
+) -> None:
+    path = tmp_path / "part.h5"
+    if len(people) == 1:
+        with refused(CaptureError, "person 1 did not enter"):
+            track_entering(path, people, 3)
+    else:
+        track_entering(path, people, 3)
+    track_entering(path, people, 14, resume=len(people) > 1)  # 3 is before, 14 after the person enters
+    whole = second[:1] if len(people) == 1 else everybody  # in the order in which they came
+    for one, other in zip(track_entering(path, people, resume=True), whole, strict=True):
         np.testing.assert_array_equal(one.frames, other.frames)
         np.testing.assert_array_equal(one.pose, other.pose)
         np.testing.assert_array_equal(one.status, other.status)
@@ -355,5 +366,5 @@ def test_attempts_to_track_somebody_who_is_refused_are_twice_as_far_apart_each_t
         begin(people, member, frames, *rest)
 
     monkeypatch.setattr(People, "_begin", refuse_others)
-    _, found = track_entering(tmp_path / "r.h5", 17)
+    found = track_entering(tmp_path / "r.h5", stop=17)
     assert len(found) == 1 and attempts == [0, 10, 12, 16]  # at 4 Hz, from the eighth frame on

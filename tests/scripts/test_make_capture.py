@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +39,14 @@ def tiny() -> Plan:
     return plan_capture(TINY)
 
 
-@pytest.fixture(scope="module", params=list(MOTIONS))
+@cache
+def plan_of(motion: str) -> Plan:
+    return plan_capture(Options(motion=motion, size=(80, 60)))
+
+
+@pytest.fixture(params=list(MOTIONS))
 def plan(request: pytest.FixtureRequest) -> Plan:
-    return plan_capture(Options(motion=request.param, size=(80, 60)))
+    return plan_of(request.param)
 
 
 def joint(plan: Plan, name: str) -> np.ndarray:
@@ -143,14 +149,14 @@ def test_paper_sequences_contain_their_motions() -> None:
     assert {cube.held_by(frame) for frame in range(cube.frames)} == {"_l", "_r"}
     assert degrees("kick")["hip_flex_r"].max() > 70
     assert degrees("kick")["hip_flex_l"].max() > 70
-    pedal = plan_capture(Options(motion="pedal", size=(80, 60)))
+    pedal = plan_of("pedal")
     apart = (joint(pedal, "wrist_l") - joint(pedal, "wrist_r"))[30:90]
     turns = np.unwrap(np.arctan2(apart[:, 2], apart[:, 0]))
     assert abs(turns[-1] - turns[0]) > 2 * 2 * np.pi
 
 
 def test_turn_is_a_full_turn_with_stepping_feet() -> None:
-    plan = plan_capture(Options(motion="turn", size=(80, 60)))
+    plan = plan_of("turn")
     across = (joint(plan, "hip_l") - joint(plan, "hip_r"))[:, :2]
     heading = np.degrees(np.unwrap(np.arctan2(across[:, 1], across[:, 0])))
     assert heading[-1] - heading[0] == pytest.approx(360, abs=1)
@@ -173,7 +179,7 @@ def test_turn_is_a_full_turn_with_stepping_feet() -> None:
 
 
 def test_crouch_goes_over_one_knee_to_the_heels_and_up_again() -> None:
-    plan = plan_capture(Options(motion="crouch", size=(80, 60)))
+    plan = plan_of("crouch")
     h = plan.options.stature_m
     clear = np.stack([joint(plan, "knee" + side)[:, 2] for side in ("_l", "_r")], axis=1) - KNEE_RADIUS * h
     assert clear.min() > -0.003

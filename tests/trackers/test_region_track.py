@@ -169,18 +169,20 @@ def test_a_killed_causal_run_is_resumed_and_equals_an_uninterrupted_one(
 ) -> None:
     result = tmp_path / "r.h5"
     command = ["track", tiny, "-o", result, "--config", quick, "--causal"]
-    killed = send(signal.SIGKILL, 5, *command)
+    killed = send(signal.SIGKILL, 5, *command, write_every_s=0.05)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert killed.stdout == ""
-    assert_same(result, causal, slice(0, 6))
+    done = len(read_result(result).frames)  # frames that are written together may be more than those reported
+    assert 6 <= done < FRAMES
+    assert_same(result, causal, slice(0, done))
     ran = tk(*command, "--resume")
     assert ran.code == 0, ran.err
-    assert ran.messages[0] == f"note: 6 of {FRAMES} frames are finished already"
+    assert ran.messages[0] == f"note: {done} of {FRAMES} frames are finished already"
     assert ran.err.splitlines()[-1].startswith(f"{FRAMES} frames in {result}, 0 lost")
     assert_same(result, causal)
     assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]  # the killed run's scraps are gone
-    done = tk(*command, "--resume")  # nothing is left to do
-    assert done.code == 0 and f"{FRAMES} of {FRAMES} frames are finished already" in done.err
+    again = tk(*command, "--resume")  # nothing is left to do
+    assert again.code == 0 and f"{FRAMES} of {FRAMES} frames are finished already" in again.err
     assert_same(result, causal)
 
 
@@ -234,10 +236,9 @@ def test_a_result_after_its_second_pass_cannot_be_extended(tk: Tk, tiny: Path, q
     assert result.read_bytes() == before
 
 
-@pytest.mark.parametrize("frames", [(0, 1), (0, 6)])
-def test_a_causal_result_can_be_extended(tiny: Path, causal: Path, tmp_path: Path, frames: tuple[int, int]) -> None:
-    run(tiny, tmp_path / "r.h5", frames=frames, causal=True)
-    assert_same(tmp_path / "r.h5", causal, slice(*frames))
+def test_a_causal_result_can_be_extended(tiny: Path, causal: Path, tmp_path: Path) -> None:
+    run(tiny, tmp_path / "r.h5", frames=(0, 1), causal=True)
+    assert_same(tmp_path / "r.h5", causal, slice(0, 1))
     run(tiny, tmp_path / "r.h5", resume=True, causal=True)
     assert_same(tmp_path / "r.h5", causal)
 
