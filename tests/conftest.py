@@ -67,14 +67,17 @@ def development_capture(name: str) -> Path:
     return folder
 
 
-# settings for a run of one or two seconds: coarse, with short body fits and without a second process
+# settings for a run of one or two seconds: coarse, with the body of a person of average build, without a second process
 QUICK = """
 voxels = 32
 ahead = 0
 effort = 0.15
 [silhouette]
 init_frames = 3
+adapt = false
 """
+# the same with a body that is fitted
+FITTED = QUICK.replace("adapt = false", "adapt = true")
 
 
 def track(

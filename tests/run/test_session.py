@@ -20,7 +20,7 @@ import pytest
 import tomli_w
 
 from tests import conftest
-from tests.conftest import FRAMES, QUICK, Silent, Tk
+from tests.conftest import FITTED, FRAMES, QUICK, Silent, Tk
 from tests.io.conftest import write_picture
 from tk.errors import ConfigError, ResultError
 from tk.io import settings_file
@@ -142,7 +142,6 @@ def test_frames_are_reported_after_they_are_written(
 
 
 def test_a_run_can_be_extended(tiny: Path, tracked: Path, tmp_path: Path) -> None:
-    """The body is fitted to the same frames however few are asked for."""
     run(tiny, tmp_path / "r.h5", frames=(0, 1), store_hull=True)
     assert_same(tmp_path / "r.h5", tracked, slice(0, 1))
     run(tiny, tmp_path / "r.h5", resume=True, store_hull=True)
@@ -344,7 +343,7 @@ def test_requested_frames_are_tracked(tiny: Path) -> None:
 
 @pytest.mark.parametrize(("method", "segmentation"), [("region", "collinearity"), ("volumetric", "mog2")])
 def test_masks_are_made_from_the_videos(tiny: Path, tmp_path: Path, method: str, segmentation: str) -> None:
-    config, path = settings_file.from_toml(f'segmentation = "{segmentation}"\n{QUICK}'), tmp_path / "r.h5"
+    config, path = settings_file.from_toml(f'segmentation = "{segmentation}"\n{FITTED}'), tmp_path / "r.h5"
     capture = open_capture(tiny, masks="none")
     assert conftest.track(capture, path, config, method=method, frames=(0, 4)).lost == 0
     found, truth = read_result(path), read_joints(tiny / "truth.h5").positions[:4]

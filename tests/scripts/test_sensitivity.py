@@ -15,7 +15,7 @@ import pytest
 
 from scripts import sensitivity
 from scripts.sensitivity import Run, main, measure, scaled, tolerated, value_of
-from tests.conftest import QUICK
+from tests.conftest import FITTED
 from tk.cli import main as tk
 
 
@@ -95,7 +95,7 @@ def test_tiny_capture_is_tracked_with_each_value(
 
     monkeypatch.setattr(subprocess, "run", here)
     config = tmp_path / "quick.toml"
-    config.write_text(QUICK, encoding="utf-8")
+    config.write_text(FITTED, encoding="utf-8")
     options = ["--factors", "0.5", "--frames", "0:3", "--masks", "auto", "--config", str(config), "--limit", "100"]
     main(["silhouette.init_frames", "--captures", str(tiny), *options])
     lines = capsys.readouterr().out.splitlines()

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.conftest import FRAMES, QUICK
+from tests.conftest import FITTED, FRAMES
 from tk.errors import CaptureError
 from tk.io import settings_file
 from tk.io.captures.capture import Capture, open_capture
@@ -24,7 +24,7 @@ from tk.trackers.camera_monitor import CameraMonitor
 from tk.trackers.protocol import Estimate, Observation
 from tk.trackers.region import RegionTracker
 
-CONFIG = settings_file.from_toml(QUICK)
+CONFIG = settings_file.from_toml(FITTED)
 Spoil = Callable[[Observation], Observation]
 
 
