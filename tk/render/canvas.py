@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from tk.errors import ExportError, TkError
 from tk.io.paths import replacing
-from tk.model.body.joints import BONES
-from tk.model.body.skeleton import JOINTS
+from tk.model.body.joints import BONE_ENDS, JOINTS
 from tk.model.cameras.camera import Camera
 from tk.model.masks.regions import SQUARE3
 from tk.render.figure import Figure, Seen
@@ -26,7 +25,6 @@ Image = NDArray[np.uint8]
 _FILL = 0.35  # opacity of the body
 #: fractional bits of OpenCV's drawing coordinates
 SUBPIXEL_BITS = 4
-_BONES = np.array([(JOINTS.index(a), JOINTS.index(b)) for a, b in BONES])
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
@@ -127,7 +125,7 @@ def draw_joints(tile: Image, xy: Float, colors: Sequence[Color | None], lost: bo
     points = fixed(np.nan_to_num(xy))
     seen = np.asarray(np.isfinite(xy).all(axis=1))
     plain = LOST_BODY if lost else BONE
-    bones = list(points[_BONES[seen[_BONES].all(axis=1)]])
+    bones = list(points[BONE_ENDS[seen[BONE_ENDS].all(axis=1)]])
     # the dark outline is drawn without antialiasing, in a quarter of the time
     cv2.polylines(tile, bones, False, INK, 3, cv2.LINE_8, SUBPIXEL_BITS)
     cv2.polylines(tile, bones, False, plain, 1, cv2.LINE_AA, SUBPIXEL_BITS)

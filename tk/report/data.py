@@ -15,7 +15,7 @@ from tk.evaluation.people import evaluate_people
 from tk.io.results.data import Result
 from tk.io.results.reader import joint_tracks, positions_at, read_people
 from tk.io.results.status import STATUS_MEANING, Status
-from tk.model.body.joints import BONES, HINGES, JOINTS, LIMB_JOINTS, SEGMENTS
+from tk.model.body.joints import BONE_ENDS, HINGES, JOINTS, LIMB_JOINTS, SEGMENTS
 from tk.model.cameras.camera import Rig
 from tk.render.figure import AROUND, Figure
 from tk.render.palette import (
@@ -139,7 +139,7 @@ def _scene(stage: Stage, rig: Rig | None) -> dict[str, Any]:
     """Return what does not move."""
     T = _on_floor(stage)
     return {
-        "bones": [[JOINTS.index(a), JOINTS.index(b)] for a, b in BONES],
+        "bones": BONE_ENDS.tolist(),
         "around": AROUND,
         "cameras": [
             {"name": camera.name, "points": packed(camera_pyramid(camera) @ T[:3, :3].T + T[:3, 3])}

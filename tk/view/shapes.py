@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.io.results.data import HullPoints
-from tk.model.body.joints import BONES
-from tk.model.body.skeleton import JOINTS, SEGMENTS
+from tk.model.body.joints import BONE_ENDS, SEGMENTS
 from tk.model.cameras.camera import Rig
 from tk.render.figure import Figure
 from tk.render.palette import BONE, sigma_colors, unit_rgb
@@ -46,8 +45,7 @@ def body_mesh(figure: Figure, row: int) -> Any:
 
 def skeleton_lines(joints: Float) -> Any:
     """Return the bones between joints (15, 3), without bones to a joint that is NaN."""
-    pairs = np.array([[JOINTS.index(a), JOINTS.index(b)] for a, b in BONES])
-    return _lines(joints, pairs[np.isfinite(joints[pairs]).all(axis=(1, 2))])
+    return _lines(joints, BONE_ENDS[np.isfinite(joints[BONE_ENDS]).all(axis=(1, 2))])
 
 
 def joint_spheres(joints: Float, sigma: Float | None) -> Any:

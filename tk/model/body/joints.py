@@ -193,6 +193,8 @@ REQUIRED_JOINTS = tuple(name for name in JOINTS if not ROWS[name].added)
 SEGMENTS = tuple(row.turns for added in (False, True) for row in TABLE if row.turns and row.added_dofs == added)
 #: bones of drawings, as pairs of joints
 BONES = tuple((row.bone_from, row.name) for row in TABLE if row.bone_from)
+#: (B, 2) indices of these joints in :data:`JOINTS`
+BONE_ENDS = np.array([[JOINTS.index(name) for name in bone] for bone in BONES])
 #: the segments of the chains that are optimised one by one with the torso held (section 6.4)
 CHAINS: dict[str, tuple[str, ...]] = {
     chain: tuple(row.turns for row in TABLE if row.chain == chain and row.turns)
