@@ -308,9 +308,10 @@ def test_frames_without_known_joints_are_reported(
     assert np.flatnonzero(np.isnan(result.sigma).all(axis=1)).tolist() == list(range(first, 4))
     (line,) = (note for note in result.notes if "σ is unknown" in note)
     assert line.endswith(f"σ is unknown, frames {first} to 3") and line in reporter.notes
-    notes: list[str] = []
-    assert len(list(estimates(task(tiny, (0, 5)), notes.append))) == 5
-    assert any(note.endswith("σ is unknown, frames 2 to 3") for note in notes)
+    if causal:  # returned estimates are those of the first pass
+        notes: list[str] = []
+        assert len(list(estimates(task(tiny, (0, 5)), notes.append))) == 5
+        assert any(note.endswith("σ is unknown, frames 2 to 3") for note in notes)
 
 
 # --- bodies from files ------------------------------------------------------------------------------------------------
