@@ -253,8 +253,7 @@ class _Finisher:
         """Mark frames as suspect whose residual contradicts the pose; their sigma is unknown, as it is where the
         residual is high."""
         sigma, tracked = draft.current("joints/sigma"), ~draft.lost
-        suspect = tracked.copy()
-        suspect[suspect] = contradicted(draft.current("residual")[suspect], self.task.settings.region.false_alarm)
+        suspect = tracked & contradicted(draft.current("residual"), self.task.settings.region.false_alarm)
         unclear = draft.unclear & tracked  # tracking again may have lost frames
         unknown = tracked & np.isnan(sigma).all(axis=1)
         if second_pass:  # without one, no frame depends on later ones
