@@ -125,7 +125,7 @@ class CameraMonitor:
 
     def step(self, frame: Observation) -> tuple[Estimate, Observation]:
         """Return the estimate for the next frame, and the observation without the excluded cameras."""
-        unhealthy = self._health.look(frame.images, frame.masks)
+        unhealthy = self._health.look(frame.images, frame.masks, self._excluded)
         self.unfit = bad = self._bad(unhealthy)
         out = bad | self._excluded
         used = without_cameras(frame, out)

@@ -49,6 +49,24 @@ def test_person_and_what_moves_beside_do_not_move_the_image() -> None:
     assert measured(now, mask(60)) < 0.2
 
 
+@pytest.mark.parametrize("gain", [0.8, 0.3])
+def test_light_that_changes_moves_no_image_whose_few_details_lie_at_its_border(gain: float) -> None:
+    room = np.full((1, H, W, 3), 90.0)
+    room[:, :, :8], room[:, 225:], room[:, 30:60, 250:300] = 200.0, 200.0, 40.0
+    rng, nobody, shift = np.random.default_rng(2), np.zeros((1, H, W), np.uint8), ImageShift()
+    bright, *dim = [(k * room + rng.normal(0.0, 1.5, room.shape)).astype(np.uint8) for k in (1.0, gain, gain, gain)]
+    shift.look(bright, nobody)
+    assert max(W * float(shift.look(image, nobody)[0]) for image in dim) < 0.1
+
+
+def test_person_outside_a_doubtful_mask_does_not_move_the_image() -> None:
+    shift, doubtful = ImageShift(), np.ones(1, np.bool_)
+    shift.look(view()[None], np.zeros((1, H, W), np.uint8), doubtful)
+    shift.look(view(person=10)[None], mask(10)[None], ~doubtful)
+    moved = [W * float(shift.look(view(person=k)[None], mask(k)[None], doubtful)[0]) for k in (12, 14, 16, 18)]
+    assert max(moved) < 0.2
+
+
 @pytest.mark.parametrize("levels", [0.0, 20.0])
 def test_image_without_details_has_no_shift(levels: float) -> None:
     rng = np.random.default_rng(2)

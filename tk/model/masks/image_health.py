@@ -62,12 +62,15 @@ class ImageHealth:
         self._masks: NDArray[np.bool_] | None = None  # (C, C, h, w): at camera c's reference frame those of all
         self._shift = ImageShift()
 
-    def look(self, images: NDArray[np.uint8], masks: NDArray[np.uint8]) -> list[str | None]:
+    def look(
+        self, images: NDArray[np.uint8], masks: NDArray[np.uint8], doubtful: NDArray[np.bool_] | None = None
+    ) -> list[str | None]:
         """Return for each camera :data:`BLANK`, :data:`FROZEN`, :data:`MOVED` or, if nothing is wrong, None.
 
         Args:
             images: (C, H, W, 3) BGR; if it is empty, frozen cameras are found from the masks alone.
             masks: (C, H, W), 128 and more where the person is.
+            doubtful: (C,) cameras whose mask may not show the person; None: none.
         """
         C = len(masks)
         step = max(1, masks.shape[1] // _ROWS)
@@ -79,7 +82,7 @@ class ImageHealth:
         if given:
             for c in np.flatnonzero(shown.reshape(C, -1).std(axis=1) < _BLANK_LEVELS).tolist():
                 found[c] = BLANK
-            for c in np.flatnonzero(self._shift.look(images, masks) > MOST_SHIFT).tolist():
+            for c in np.flatnonzero(self._shift.look(images, masks, doubtful) > MOST_SHIFT).tolist():
                 found[c] = found[c] or MOVED
         if self._references is None or self._masks is None or self._references.shape != shown.shape:
             self._references, self._masks = shown, np.repeat(small[None], C, axis=0)

@@ -1,9 +1,10 @@
 """How far the still parts of each camera's image have moved since the first frame: a camera that was bumped or sags.
 
 The shift of an image is the translation that registers it with the first one, beside the person (Lucas & Kanade, "An
-Iterative Image Registration Technique with an Application to Stereo Vision", IJCAI 1981). Shadows and other things that
-move are outliers of the registration and have small weights (Tukey's biweight). A turn of a camera by a small angle
-shifts its whole image; a roll or a step to the side do so in part.
+Iterative Image Registration Technique with an Application to Stereo Vision", IJCAI 1981), together with the ratio of
+their contrasts, because the light may change. Shadows and other things that move are outliers of the registration and
+have small weights (Tukey's biweight). A turn of a camera by a small angle shifts its whole image; a roll or a step to
+the side do so in part.
 """
 
 from __future__ import annotations
@@ -43,21 +44,30 @@ class ImageShift:
     def __init__(self) -> None:
         self._first: NDArray[np.uint8] | None = None  # (C, h, w)
         self._still = np.zeros((0, 0, 0), np.bool_)  # (C, h, w), where nobody is in the first frame
+        self._begun = np.zeros(0, np.bool_)  # (C,) whether a camera's mask could be trusted in a frame
         self._shift = np.zeros((0, 2))
         self._calls = 0
 
-    def look(self, images: NDArray[np.uint8], masks: NDArray[np.uint8]) -> Float:
+    def look(
+        self, images: NDArray[np.uint8], masks: NDArray[np.uint8], doubtful: NDArray[np.bool_] | None = None
+    ) -> Float:
         """Return (C,) how far each camera's image has moved, as a share of its longer side; NaN if it is unknown.
 
         Args:
             images: (C, H, W, 3) BGR, of any but always the same size.
             masks: (C, h, w), not 0 where somebody is.
+            doubtful: (C,) cameras whose mask may not show the person. A camera's first image is that of its first frame
+                without doubt: the person must not be taken for a part of the scene. None: no camera.
         """
         C = len(images)
         if self._first is None or len(self._first) != C:
-            self._first = np.stack([_small(image[..., 1]) for image in images])  # the green channel suffices
-            self._still = np.stack([_beside(mask) for mask in masks])
-            self._shift, self._calls = np.zeros((C, 2)), 0
+            self._first = np.stack([_small(image[..., 1]) for image in images])
+            self._still = np.zeros(self._first.shape, np.bool_)
+            self._begun, self._shift, self._calls = np.zeros(C, np.bool_), np.zeros((C, 2)), 0
+        for c in np.flatnonzero(~self._begun).tolist():
+            self._first[c] = _small(images[c, ..., 1])  # the green channel suffices
+            self._still[c] = _beside(masks[c])
+        self._begun |= True if doubtful is None else ~doubtful
         if self._calls % _PAUSE:
             self._look_at(self._calls // _PAUSE % C, images, masks)
         self._calls += 1
@@ -80,7 +90,8 @@ class ImageShift:
         """Return what :meth:`restore` needs."""
         if self._first is None:
             return {}
-        return {"first": self._first, "still": self._still, "shift": self._shift, "calls": self._calls}
+        state = {"first": self._first, "still": self._still, "begun": self._begun, "shift": self._shift}
+        return {**state, "calls": self._calls}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state."""
@@ -89,6 +100,7 @@ class ImageShift:
             return
         self._first = np.array(state["first"], np.uint8)
         self._still = np.array(state["still"], np.bool_)
+        self._begun = np.array(state["begun"], np.bool_)
         self._shift = np.array(state["shift"], np.float64)
         self._calls = int(state["calls"])
 
@@ -133,7 +145,7 @@ def _register(first: Gray, now: Gray, still: NDArray[np.bool_], shift: Float) ->
     y, x = (_EVERY * at for at in np.nonzero(still[::_EVERY, ::_EVERY]))
     gradient = np.stack([cv2.Sobel(first, cv2.CV_32F, dx, 1 - dx, scale=1 / 8)[y, x] for dx in (1, 0)], axis=-1)
     border = np.array([_COARSE, _COARSE])
-    correlation = 0.0
+    correlation, gain = 0.0, np.nan
     for _ in range(_ITERATIONS):
         before = np.stack([x, y], axis=-1).astype(np.float64)
         now_at = before + shift
@@ -143,13 +155,17 @@ def _register(first: Gray, now: Gray, still: NDArray[np.bool_], shift: Float) ->
         at_x, at_y = now_at[seen].T.astype(np.float32)
         moved = cv2.remap(now, at_x, at_y, cv2.INTER_LINEAR).ravel()
         reference, G = first[y[seen], x[seen]], gradient[seen]
-        difference = moved - reference
+        if np.isnan(gain):
+            gain = float(np.linalg.norm(moved) / (np.linalg.norm(reference) + 1e-3))
+        difference = moved - gain * reference
         noise = 1.4826 * float(np.median(np.abs(difference))) + 1e-3
         weight = np.clip(1.0 - (difference / (_TUKEY * noise)) ** 2, 0.0, None) ** 2
         norm = float(np.sqrt((weight @ moved**2) * (weight @ reference**2)))
         correlation = float(weight @ (moved * reference)) / (norm + 1e-3)
-        step = np.linalg.lstsq((G * weight[:, None]).T @ G, (G * weight[:, None]).T @ difference, rcond=None)[0]
-        shift = shift - step
+        A = np.column_stack([gain * G, reference])
+        weighted = (A * weight[:, None]).T
+        *step, change = np.linalg.lstsq(weighted @ A, weighted @ difference, rcond=None)[0]
+        shift, gain = shift - step, gain + change
         if np.abs(step).max() < _CONVERGED:
             break
     return shift, correlation
