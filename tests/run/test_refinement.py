@@ -34,6 +34,7 @@ from tk.run import offline as finish
 from tk.run.delays import retimed, whole_delays
 from tk.run.refined_calibration import refine_capture
 from tk.settings import Settings
+from tk.trackers.camera_monitor import CameraMonitor
 from tk.trackers.region import UNKNOWN_AFTER
 
 TURNED = 1.0  # degrees, of cam2; a camera with a larger error is excluded
@@ -99,13 +100,24 @@ def test_reduced_images_refine_the_recorded_cameras(run: tuple[Path, Silent], tu
         np.testing.assert_allclose(refined.matrix, given.matrix, rtol=0.02)
 
 
+def test_cameras_that_were_moved_are_not_compared(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[np.ndarray] = []
+
+    def compare(tracker: Any, store: MaskStore, tracked: TrackedPoses) -> None:
+        seen.append(np.array([store.get(frame).any(axis=(1, 2)) for frame in tracked.frames.tolist()]))
+
+    monkeypatch.setattr(finish, "compare_cameras", compare)
+    monkeypatch.setattr(CameraMonitor, "moved", np.array([False, True, False, False]))
+    track(open_capture(tiny), tmp_path / "moved.h5", settings_file.from_toml(QUICK), Silent())
+    assert (seen[0] == [True, False, True, True]).all()
+
+
 def test_late_videos_are_tracked_again(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With invented delays: which frames are tracked again, and that every frame keeps its row."""
     asked: list[np.ndarray] = []
 
-    def made_up(tracker: Any, agreement: Any, store: Any, tracked: Any, *_: Any) -> Any:
-        late = np.array([0, 0, 1, -1])
-        return tracker, retimed(store, tracked.frames, late), late.astype(float)
+    def made_up(tracker: Any, *_: Any) -> Any:
+        return tracker, np.array([0.0, 0.0, 1.0, -1.0])
 
     read = Capture.frames
 

@@ -221,6 +221,7 @@ def test_two_cameras_that_turn_slowly_are_excluded(scene: Scene) -> None:
     assert [line.split(":")[0] for line in monitor.report()] == [
         f"camera {name} has been moved since the first frame" for name in ("cam3", "cam4")
     ]
+    assert monitor.moved.tolist() == [False, False, True, True]
     assert scene.error(estimates, range(FRAMES)) < 0.10
 
 

@@ -181,7 +181,7 @@ class _Finisher:
         The body is fitted to frames of the whole recording unless that began with the initialisation pose.
         """
         subject = member.subject
-        tracker, masks = self._with_final_cameras(member.number, tracker, masks, draft)
+        tracker, masks = self._with_final_cameras(member, tracker, masks, draft)
         _LOG.info("second pass")
         poses, residual, precise = tracker.second_pass(
             masks.sequence(draft.result.frames),
@@ -200,26 +200,31 @@ class _Finisher:
         return tracker
 
     def _with_final_cameras(
-        self, person: int, tracker: TwoPassTracker, masks: MaskStore, draft: _Draft
+        self, member: Member, tracker: TwoPassTracker, masks: MaskStore, draft: _Draft
     ) -> tuple[TwoPassTracker, MaskStore]:
         """Return the tracker with refined cameras, and synchronised masks, if the cameras disagree about person 0 and
-        ``settings.refine`` is True, else both as they are. Other people take over what person 0 has decided."""
+        ``settings.refine`` is True, else both as they are. Other people take over what person 0 has decided.
+
+        A camera that has been moved during the recording has no one place and is not compared.
+        """
         task, result = self.task, draft.result
         _LOG.info("second pass: comparing the cameras")
         tracked = TrackedPoses(result.frames, result.pose, result.has_pose)
-        agreement = compare_cameras(tracker, masks, tracked)
+        compared = masks.without(member.monitor.moved)
+        agreement = compare_cameras(tracker, compared, tracked)
         if apart := "" if agreement is None else agreement.contradiction:
             self.note(f"{apart}: all frames are suspect")
             draft.unclear = ~draft.lost
-        if person:
+        if member.number:
             late = np.round((self.cameras.time_offset_s - task.source.time_offset_s) * task.setup.fps).astype(np.int64)
             return tracker.with_cameras(self.cameras.rig), retimed(masks, result.frames, late)
         if agreement is None or apart or not task.settings.refine:
             return tracker, masks
-        refined = refine_if_inconsistent(tracker, agreement, masks, tracked, self.note)
+        refined = refine_if_inconsistent(tracker, agreement, compared, tracked, self.note)
         if refined is None:
             return tracker, masks
-        tracker, masks, offsets = refined
+        tracker, offsets = refined
+        masks = retimed(masks, result.frames, np.round(offsets).astype(np.int64))
         self.cameras = UsedCameras(tracker.rig, self.cameras.time_offset_s + offsets / task.setup.fps)
         if np.round(offsets).any() and self.alone:
             self.note("tracking again: the images of the first pass were not synchronised")

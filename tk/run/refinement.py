@@ -16,7 +16,7 @@ from tk.model.cameras.bundle import TrackedPoses, choose_frames
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.refinement import SCALES, Refined, RefinementSettings, refine_cameras
 from tk.model.masks.silhouettes import Views
-from tk.run.delays import retimed, whole_delays
+from tk.run.delays import whole_delays
 from tk.trackers.protocol import TwoPassTracker
 
 Float = NDArray[np.float64]
@@ -83,7 +83,7 @@ def refine_if_inconsistent(
     store: MaskStore,
     tracked: TrackedPoses,
     note: Callable[[str], None],
-) -> tuple[TwoPassTracker, MaskStore, Float] | None:
+) -> tuple[TwoPassTracker, Float] | None:
     """Refine the cameras if they disagree about the tracked person; None if they agree, or refinement does not help.
 
     Args:
@@ -94,8 +94,7 @@ def refine_if_inconsistent(
         note: receives a message about the refined cameras.
 
     Returns:
-        A tracker with the refined cameras and the same body, the synchronised masks, and the delay of each camera (C,),
-        frames.
+        A tracker with the refined cameras and the same body, and the delay of each camera (C,), frames.
     """
     world = tracker.world
     tracked = replace(tracked, poses=world.poses_in(tracked.poses))
@@ -116,5 +115,4 @@ def refine_if_inconsistent(
         f"{after:.2f}; {', '.join([f'{names[worst]} is turned most, by {done.turn_deg[worst]:.2f}°', *delays])} "
         "(refine = false keeps them)"
     )
-    synchronised = retimed(store, tracked.frames, np.round(done.offset_frames).astype(np.int64))
-    return tracker.with_cameras(world.rig_out(done.rig)), synchronised, done.offset_frames
+    return tracker.with_cameras(world.rig_out(done.rig)), done.offset_frames

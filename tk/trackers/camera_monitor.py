@@ -23,7 +23,7 @@ from tk.kernels.mask_values import OTHERS
 from tk.model.body.joint_sigma import VIEW_M
 from tk.model.body.plausibility import Plausibility, check_extent, check_stature
 from tk.model.body.skeleton import JOINTS
-from tk.model.masks.image_health import ImageHealth, described
+from tk.model.masks.image_health import MOVED, ImageHealth, described
 from tk.model.masks.mask_agreement import Agreement, MaskAgreement
 from tk.model.setup import Setup, Subject
 from tk.trackers.protocol import Estimate, Observation, Tracker, sharing, shows_person, without_cameras
@@ -179,6 +179,11 @@ class CameraMonitor:
         frames in which a baseline follows a change (1 / RATE), the level itself may have changed, and only an abnormal
         residual refuses a pose. With twice the limit, a mirrored pose was accepted for 12 frames (fault "away")."""
         return self._judge.normal if self._judge is not None and self._refused >= 1 / RATE else 1.0
+
+    @property
+    def moved(self) -> NDArray[np.bool_]:
+        """(C,) the cameras that have been moved since the first frame."""
+        return np.array([f"{camera}/{MOVED}" in self._spans for camera in range(len(self._names))])
 
     @property
     def doubted(self) -> NDArray[np.bool_]:

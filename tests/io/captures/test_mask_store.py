@@ -26,6 +26,17 @@ def test_stored_masks_are_returned_as_0_255_and_other_people(masks):
     np.testing.assert_array_equal(store.get(7), found)
 
 
+def test_a_store_without_cameras_shows_nobody_in_them():
+    store, masks = MaskStore(), np.full((3, 4, 6), 255, np.uint8)
+    masks[2, :2] = OTHERS
+    store.put(5, masks)
+    fewer = store.without(np.array([True, False, False]))
+    assert not fewer.get(5)[0].any()
+    np.testing.assert_array_equal(fewer.get(5)[1:], masks[1:])
+    np.testing.assert_array_equal(store.get(5), masks)
+    assert store.without(np.zeros(3, np.bool_)) is store
+
+
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=20)
 def test_a_sequence_of_frames_has_the_requested_order(seed):

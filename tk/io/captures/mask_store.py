@@ -131,6 +131,18 @@ class MaskStore:
             mask[y : y + h, x : x + w] |= bits[begin : begin + w * h].reshape(h, w) * np.uint8(value)
             begin += w * h
 
+    def without(self, cameras: NDArray[np.bool_]) -> MaskStore:
+        """Return a store in which some cameras (C,) show nobody: a copy, or this one if there is no such camera."""
+        if not cameras.any():
+            return self
+        result = MaskStore()
+        for index in self._places:
+            if index >= 0:
+                masks = self.get(index)
+                masks[cameras] = 0
+                result.put(index, masks)
+        return result
+
     def sequence(self, indices: NDArray[np.int64]) -> Frames:
         """Return the masks of these frames, unpacked on access."""
         return Frames(self, [int(i) for i in indices])
