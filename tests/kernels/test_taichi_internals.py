@@ -1,5 +1,6 @@
 """Launches of stored kernels equal Taichi's own launches; shortened notes still name an error's place."""
 
+import inspect
 import textwrap
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
@@ -152,6 +153,25 @@ def test_kernels_of_others_keep_their_notes():
     with pytest.raises(ti.TaichiNameError) as caught:
         _faulty()
     assert "^" in str(caught.value)
+
+
+@ti.func
+def _twice(x):
+    return 2 * x
+
+
+@ti.kernel
+def _eight_times(x: ti.i32) -> ti.i32:
+    return _twice(_twice(_twice(x)))
+
+
+def test_the_source_of_a_function_is_read_once(monkeypatch):
+    ensure_runtime()
+    read = []
+    original = inspect.getsourcelines
+    monkeypatch.setattr(inspect, "getsourcelines", lambda function: read.append(function) or original(function))
+    assert _eight_times(5) == 40
+    assert sorted(function.__name__ for function in read) == ["_eight_times", "_twice"]
 
 
 @settings(max_examples=200)

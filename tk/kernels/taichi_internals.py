@@ -195,9 +195,11 @@ def shorten_notes(utilities: Any, kernels: Any) -> bool:
         return False
     if not hasattr(full, "__wrapped__"):
         context.get_pos_info = _short_notes(full)
-    if kernels.textwrap is textwrap and getattr(kernels, "getsourcelines", None) is inspect.getsourcelines:
+    if kernels.textwrap is textwrap:
         kernels.textwrap = SimpleNamespace(fill=_fill, dedent=textwrap.dedent)
-        kernels.getsourcelines = functools.cache(inspect.getsourcelines)
+        for name in ("getsourcefile", "getsourcelines"):
+            if callable(read := getattr(kernels, name, None)):
+                setattr(kernels, name, functools.cache(read))
     return True
 
 
