@@ -9,10 +9,10 @@ from tests.model.figures import BODY, DIMENSIONS, surface_points
 from tk.errors import ConfigError
 from tk.kernels.cone_arrays import MOST_PARTS, PART_DOF, PART_FRAME
 from tk.kernels.cones import CONE, ELLIPSOID
-from tk.model.body.anthropometry import HAIR
-from tk.model.body.cone_body import ConePart, build_cone_body
+from tk.model.body.anthropometry import HAIR, BodyDimensions
+from tk.model.body.cone_body import SHAPE_NUMBERS, ConePart, build_cone_body, part_arrays
 from tk.model.body.gait_poses import standing_pose, walking_pose
-from tk.model.body.skeleton import JOINTS, up_rotation
+from tk.model.body.skeleton import JOINTS, build_skeleton, up_rotation
 
 
 def surface_of(part: ConePart) -> np.ndarray:
@@ -109,3 +109,28 @@ def test_body_with_too_many_parts_for_the_kernels_is_refused():
     with pytest.raises(ConfigError, match=f"{len(parts)} parts"):
         replace(BODY, parts=parts).pack(np.float32)
     assert len(replace(BODY, parts=parts[:MOST_PARTS]).pack(np.float32).parts) == MOST_PARTS
+
+
+@pytest.mark.parametrize("up", ["z", "x"])
+def test_many_bodies_at_once_equal_each_alone(up):
+    rng = np.random.default_rng(4)
+    values = DIMENSIONS.values * np.exp(rng.normal(0, 0.1, (5, len(DIMENSIONS.values))))
+    change = rng.normal(0, 0.02, (len(BODY.shape_groups), SHAPE_NUMBERS))
+    several = BodyDimensions.of(values)
+    np.testing.assert_array_equal(several.values, values)
+    shapes, frames = BODY.reshape(*part_arrays(several), change)
+    skeletons = build_skeleton(several, up)
+    for n, row in enumerate(values):
+        alone = build_cone_body(BodyDimensions.of(row), up).reshaped(change)
+        np.testing.assert_allclose(shapes[n], alone.shape, rtol=1e-14)
+        np.testing.assert_allclose(frames[n], [part.T_body_part for part in alone.parts], atol=1e-14)
+        for name in ("point", "rise", "joint_position"):
+            expected = getattr(alone.skeleton, name)
+            np.testing.assert_allclose(getattr(skeletons, name)[n], expected, atol=1e-14, err_msg=name)
+
+
+def test_an_impossible_dimension_of_one_of_many_bodies_is_named():
+    values = np.tile(DIMENSIONS.values, (3, 1))
+    values[1, 9] = -0.4
+    with pytest.raises(ConfigError, match=r"body dimension calf = -0.4 m must lie between"):
+        BodyDimensions.of(values)

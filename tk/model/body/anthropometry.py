@@ -11,6 +11,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tk.errors import ConfigError
 from tk.model.setup import AVERAGE_STATURE_M
 
@@ -62,7 +65,8 @@ HAIR = 0.008  # above the crown
 class BodyDimensions:
     """Lengths and radii of one person's body, metres. Left and right are alike.
 
-    Lengths are between joint centres; radii are those of the clothed surface about a segment's axis.
+    Lengths are between joint centres; radii are those of the clothed surface about a segment's axis. A function of
+    dimensions alone also takes those of N bodies, (N, 1) each.
     """
 
     trunk: float
@@ -91,10 +95,20 @@ class BodyDimensions:
     ankle_radius: float
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not 0 < value < 3:
-                raise ConfigError(f"body dimension {field.name} = {value} m must lie between 0 and 3 m")
+        wrong = ~((self.values > 0) & (self.values < 3))
+        if wrong.any():
+            name, value = DIMENSIONS[int(wrong.nonzero()[-1][0])], self.values[wrong][0]
+            raise ConfigError(f"body dimension {name} = {value} m must lie between 0 and 3 m")
+
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """(24,) or (N, 24) the dimensions in the order of :data:`DIMENSIONS`."""
+        return np.hstack([getattr(self, name) for name in DIMENSIONS])
+
+    @staticmethod
+    def of(values: NDArray[np.float64]) -> BodyDimensions:
+        """Return the dimensions of one body from :attr:`values` (24,), or of N bodies from (N, 24)."""
+        return BodyDimensions(*(values.tolist() if values.ndim == 1 else values.T[:, :, None]))
 
     @staticmethod
     def from_stature(stature_m: float) -> BodyDimensions:
@@ -106,6 +120,9 @@ class BodyDimensions:
         """Crown to sole when standing, metres."""
         return self.head + self.trunk + self.thigh + self.calf + self.ankle_height
 
+
+#: names of the dimensions
+DIMENSIONS = tuple(field.name for field in fields(BodyDimensions))
 
 #: the average body, for a person of whom nothing is known, and where only the names of a skeleton matter
 AVERAGE_BODY = BodyDimensions.from_stature(AVERAGE_STATURE_M)

@@ -7,7 +7,7 @@ along an occluding contour the surface slides in the image's tangent only.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from tk.kernels.cones import CONE
 from tk.kernels.silhouette import Edgels
-from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.cone_body import SHAPE_NUMBERS, ConeBody, ConePart, build_cone_body, group_of
+from tk.model.body.anthropometry import DIMENSIONS, BodyDimensions
+from tk.model.body.cone_body import SHAPE_NUMBERS, ConeBody, ConePart, build_cone_body, group_of, part_arrays
+from tk.model.body.skeleton import build_skeleton
 
 Float = NDArray[np.float64]
 
@@ -49,7 +50,6 @@ _SHAPES = {"hand_": _END, "foot_": _END, "head": _HEAD}
 # Difference of a dimension's logarithm for its derivative: curvature then changes the derivative by 1e-6, float64's
 # rounding by less.
 _STEP = 1e-6
-_DIMENSIONS = tuple(field.name for field in fields(BodyDimensions))
 
 
 class BodyFamily:
@@ -67,24 +67,24 @@ class BodyFamily:
         self.average, self.stature_deviation = average, stature_deviation
         self.groups = build_cone_body(average).shape_groups
         shapes = [_SHAPES.get(name, _LIMB if name.endswith("_") else _TRUNK) for name in self.groups]
-        logs = np.log([getattr(average, name) for name in _DIMENSIONS])
-        self.mean = np.concatenate([logs, np.zeros(SHAPE_NUMBERS * len(self.groups))])
-        self.deviation = np.concatenate([[_LENGTHS.get(name, _RADII) for name in _DIMENSIONS], np.ravel(shapes)])
+        self.mean = np.concatenate([np.log(average.values), np.zeros(SHAPE_NUMBERS * len(self.groups))])
+        self.deviation = np.concatenate([[_LENGTHS.get(name, _RADII) for name in DIMENSIONS], np.ravel(shapes)])
         self.start = self.mean.copy()
 
     @staticmethod
     def around(body: ConeBody, stature_deviation: float) -> BodyFamily:
         """Return the family whose prior is about a body's dimensions and which begins at the body."""
         family = BodyFamily(body.dimensions, stature_deviation)
-        family.start[len(_DIMENSIONS) :] = shapes_of(body).ravel()
+        family.start[len(DIMENSIONS) :] = shapes_of(body).ravel()
         return family
 
     def build(self, shared: Float) -> ConeBody:
         """Return the body with parameters (K,)."""
-        values = np.exp(shared[: len(_DIMENSIONS)])
-        dimensions = BodyDimensions(**dict(zip(_DIMENSIONS, values.tolist(), strict=True)))
-        change = shared[len(_DIMENSIONS) :].reshape(len(self.groups), SHAPE_NUMBERS)
-        return build_cone_body(dimensions).reshaped(change)
+        return build_cone_body(BodyDimensions.of(np.exp(shared[: len(DIMENSIONS)]))).reshaped(self._change(shared))
+
+    def _change(self, shared: Float) -> Float:
+        """Return the change (G, 8) of the parts' shapes that is among parameters (K,)."""
+        return shared[len(DIMENSIONS) :].reshape(len(self.groups), SHAPE_NUMBERS)
 
     def linearised(self, shared: Float, poses: Float) -> LinearisedBody:
         """Return the body with parameters (K,) at poses (M, D), and its derivatives by the dimensions.
@@ -93,12 +93,11 @@ class BodyFamily:
         """
         body = self.build(shared)
         s = body.skeleton
-        changed = [self.build(shared + step) for step in _STEP * np.eye(len(_DIMENSIONS), len(shared))]
-        by_part = np.array([_part_numbers(other) - _part_numbers(body) for other in changed]) / _STEP
-        point, rise = (
-            np.array([getattr(other.skeleton, name) - getattr(s, name) for other in changed]) / _STEP
-            for name in ("point", "rise")
-        )
+        others = BodyDimensions.of(np.exp(shared[: len(DIMENSIONS)] + _STEP * np.eye(len(DIMENSIONS))))
+        shape, T = body.reshape(*part_arrays(others), self._change(shared))
+        by_part = (_part_numbers(shape, s.in_world(T)) - _part_numbers(body.shape, body.frames[1])) / _STEP
+        changed = build_skeleton(others)
+        point, rise = (changed.point - s.point) / _STEP, (changed.rise - s.rise) / _STEP
         moves = s.segment_moves(poses, point, rise)
         twists = np.concatenate(s.twists(poses), axis=-1).swapaxes(-1, -2)
         return LinearisedBody(body, s.segment_transforms(poses), twists, by_part.transpose(1, 2, 0), moves)
@@ -107,11 +106,11 @@ class BodyFamily:
         """Add the prior at parameters (K,) to their normal equations (K, K), (K,)."""
         H += np.diag(self.deviation**-2)
         g += (self.mean - shared) / self.deviation**2
-        lengths = dict(zip(_DIMENSIONS, np.exp(shared[: len(_DIMENSIONS)]), strict=True))
+        lengths = dict(zip(DIMENSIONS, np.exp(shared[: len(DIMENSIONS)]), strict=True))
         stature = sum(lengths[name] for name in _STATURE)
         row = np.zeros(len(shared))
         for name in _STATURE:
-            row[_DIMENSIONS.index(name)] = lengths[name] / stature / self.stature_deviation
+            row[DIMENSIONS.index(name)] = lengths[name] / stature / self.stature_deviation
         H += np.outer(row, row)
         g += row * np.log(self.average.stature / stature) / self.stature_deviation
 
@@ -168,12 +167,15 @@ class LinearisedBody:
         return rows
 
 
-def _part_numbers(body: ConeBody) -> Float:
-    """Return (P, 17) the numbers on which a point of each part depends linearly: the part's place in its segment
-    (12), and with z = z / h the factors of x / a r, z x / a r, y / b r, z y / b r and z."""
-    a, b, h, m = body.shape.T
-    _, inside = body.frames
-    return np.column_stack([inside[:, :3].reshape(-1, 12), a, a * (m - 1), b, b * (m - 1), h])
+def _part_numbers(shape: Float, T_segment_part: Float) -> Float:
+    """Return (..., P, 17) the numbers on which a point of each part depends linearly: the part's place in its segment
+    (12), and with z = z / h the factors of x / a r, z x / a r, y / b r, z y / b r and z.
+
+    ``shape`` (..., P, 4), ``T_segment_part`` (..., P, 4, 4).
+    """
+    a, b, h, m = np.moveaxis(shape, -1, 0)
+    place = T_segment_part[..., :3, :].reshape(*shape.shape[:-1], 12)
+    return np.concatenate([place, np.stack([a, a * (m - 1), b, b * (m - 1), h], axis=-1)], axis=-1)
 
 
 def shape_rows(body: ConeBody, T_world_part: Float, edgels: Edgels) -> Float:

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tk.errors import ConfigError
 from tk.kernels.cone_arrays import MOST_PARTS, ConeArrays, pack_parts
@@ -27,7 +28,7 @@ from tk.model.body.anthropometry import (
     BodyDimensions,
 )
 from tk.model.body.joints import ARM, CHAIN_OF_SEGMENT, CROOK, ELBOW_AXIS, LIMBS, ROWS, SEGMENTS, side_of
-from tk.model.body.skeleton import Skeleton, build_skeleton, up_rotation
+from tk.model.body.skeleton import Skeleton, build_skeleton, cross, up_rotation
 
 Float = NDArray[np.float64]
 
@@ -161,30 +162,37 @@ class ConeBody:
                 two numbers at its beginning (a cone's z = 0, an ellipsoid's lower pole), two at its end. The right
                 side is the left's mirror image.
         """
-        rows = change[self.group]
-        shape, cone, side = self.shape, self.is_cone, self.mirror
         T = np.array([part.T_body_part for part in self.parts])
-        h = shape[:, 2]
-        # both ends of the axis in the part's frame, then in the body's
-        low = np.column_stack([rows[:, 4], side * rows[:, 5], np.where(cone, 0.0, -h)])
-        high = np.column_stack([rows[:, 6], side * rows[:, 7], h])
-        begin, end = ((T[:, :3, :3] @ point[:, :, None])[:, :, 0] + T[:, :3, 3] for point in (low, high))
-        frames = np.tile(np.eye(4), (len(T), 1, 1))
-        axis = _unit(end - begin)
-        front = T[:, :3, 0]
-        frames[:, :3, 0] = _unit(front - (front * axis).sum(axis=1, keepdims=True) * axis)
-        frames[:, :3, 1] = np.cross(axis, frames[:, :3, 0])
-        frames[:, :3, 2] = axis
-        frames[:, :3, 3] = np.where(cone[:, None], begin, 0.5 * (begin + end))
-        growth = np.exp(rows[:, [0, 1, 3, 2]])
-        growth[~cone, 3] = 1.0
+        shape, frames = self.reshape(self.shape, T, change)
         return replace(
             self,
             parts=tuple(
                 replace(part, shape=tuple(sizes), T_body_part=frame)
-                for part, sizes, frame in zip(self.parts, (shape * growth).tolist(), frames, strict=True)
+                for part, sizes, frame in zip(self.parts, shape.tolist(), frames, strict=True)
             ),
         )
+
+    def reshape(self, shape: Float, T: Float, change: Float) -> tuple[Float, Float]:
+        """Return shapes (..., P, 4) and frames (..., P, 4, 4) of parts of these names after a change, see
+        :meth:`reshaped`."""
+        rows, cone, side = change[self.group], self.is_cone, self.mirror
+        h = shape[..., 2]
+        # both ends of the axis in the part's frame, then in the body's
+        ends = ((rows[:, 4], side * rows[:, 5], np.where(cone, 0.0, -h)), (rows[:, 6], side * rows[:, 7], h))
+        begin, end = (
+            (T[..., :3, :3] @ np.stack(np.broadcast_arrays(*point), axis=-1)[..., None])[..., 0] + T[..., :3, 3]
+            for point in ends
+        )
+        frames = np.broadcast_to(np.eye(4), T.shape).copy()
+        axis = _unit(end - begin)
+        front = T[..., :3, 0]
+        frames[..., :3, 0] = _unit(front - (front * axis).sum(axis=-1, keepdims=True) * axis)
+        frames[..., :3, 1] = cross(axis, frames[..., :3, 0])
+        frames[..., :3, 2] = axis
+        frames[..., :3, 3] = np.where(cone[:, None], begin, 0.5 * (begin + end))
+        growth = np.exp(rows[:, [0, 1, 3, 2]])
+        growth[~cone, 3] = 1.0
+        return shape * growth, frames
 
     def part_transforms(self, T_world_segment: Float) -> Float:
         """Return (..., P, 4, 4) from each part to the world, from the segments' (..., S, 4, 4)."""
@@ -208,8 +216,19 @@ class ConeBody:
 
 
 def _unit(vectors: Float) -> Float:
-    """Return vectors (N, 3) of length 1."""
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+    """Return vectors (..., 3) of length 1."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+class _Part(NamedTuple):
+    """A part of N bodies, see :class:`ConePart`."""
+
+    name: str
+    segment: str
+    kind: int
+    shape: Float  # (N, 4)
+    T_body_part: Float  # (N, 4, 4)
+    ends: tuple[bool, bool] = (False, False)
 
 
 def build_cone_body(dimensions: BodyDimensions, up: str = "z") -> ConeBody:
@@ -222,7 +241,21 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z") -> ConeBody:
         dimensions: lengths and radii, metres.
         up: the world axis that points up.
     """
-    d = dimensions
+    parts = tuple(
+        ConePart(name, segment, kind, tuple(shape[0].tolist()), T[0], ends)
+        for name, segment, kind, shape, T, ends in _parts(BodyDimensions.of(dimensions.values[None]))
+    )
+    return ConeBody(dimensions, build_skeleton(dimensions, up), parts)
+
+
+def part_arrays(dimensions: BodyDimensions) -> tuple[Float, Float]:
+    """Return the shapes (N, P, 4) and frames (N, P, 4, 4) of the parts of N bodies of dimensions (N, 1)."""
+    parts = _parts(dimensions)
+    return np.stack([part.shape for part in parts], axis=1), np.stack([part.T_body_part for part in parts], axis=1)
+
+
+def _parts(d: BodyDimensions) -> list[_Part]:
+    """Return the parts of N bodies of dimensions (N, 1)."""
     x, y, z = np.eye(3)
     parts = _trunk_and_head(d)
     for side, sign in (("l", 1.0), ("r", -1.0)):
@@ -235,9 +268,9 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z") -> ConeBody:
         parts.append(_between(forearm, forearm, crook, wrist, d.elbow_radius, d.wrist_radius, z))
         # half open: a little shorter than the stretched hand, wider than the wrist across the palm; the thumb's
         # side is the one to which the elbow bends
-        shape = (0.9 * d.wrist_radius, 1.4 * d.wrist_radius, 0.95 * d.hand, 0.6)
+        shape = _shape(0.9 * d.wrist_radius, 1.4 * d.wrist_radius, 0.95 * d.hand, 0.6)
         frame = _frame(wrist, M @ ARM, M @ ELBOW_AXIS)
-        parts.append(ConePart(f"hand_{side}", forearm, CONE, shape, frame, ends=(False, True)))
+        parts.append(_Part(f"hand_{side}", forearm, CONE, shape, frame, ends=(False, True)))
         hip, knee, ankle = (ROWS[name].place(d) for name in LIMBS[f"leg_{side}"])
         # the surface lies in front of the hip, behind the knee and outside of the ankle
         top = hip + PELVIS_FORWARD * d.stature * x
@@ -245,10 +278,10 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z") -> ConeBody:
         low = ankle + ANKLE_OUTWARD * d.stature * (M @ y)
         parts.append(_between(f"thigh_{side}", f"thigh_{side}", top, hollow, d.thigh_radius, d.knee_radius))
         parts += _calf(side, hollow, low, d) + _foot(side, ankle, d)
-    return ConeBody(d, build_skeleton(d, up), tuple(parts))
+    return parts
 
 
-def _calf(side: str, knee: Float, ankle: Float, d: BodyDimensions) -> list[ConePart]:
+def _calf(side: str, knee: Float, ankle: Float, d: BodyDimensions) -> list[_Part]:
     """Return two frusta that meet where the muscle is thickest."""
     share = 0.35
     belly = knee + share * (ankle - knee)
@@ -262,25 +295,25 @@ def _calf(side: str, knee: Float, ankle: Float, d: BodyDimensions) -> list[ConeP
 
 def _between(
     name: str, segment: str, begin: Float, end: Float, r0: float, r1: float, toward: Float = _FORWARD
-) -> ConePart:
+) -> _Part:
     """Return a frustum whose x axis is as close as possible to the direction ``toward``."""
-    length = float(np.linalg.norm(end - begin))
+    length = np.linalg.norm(end - begin, axis=-1, keepdims=True)
     axis = (end - begin) / length
-    front = toward - (toward @ axis) * axis
-    return ConePart(name, segment, CONE, (r0, r0, length, r1 / r0), _frame(begin, axis, front / np.linalg.norm(front)))
+    front = toward - (axis @ toward)[:, None] * axis
+    return _Part(name, segment, CONE, _shape(r0, r0, length, r1 / r0), _frame(begin, axis, _unit(front)))
 
 
-def _foot(side: str, ankle: Float, d: BodyDimensions) -> list[ConePart]:
+def _foot(side: str, ankle: Float, d: BodyDimensions) -> list[_Part]:
     """Return a flat sole from heel to toes, and the instep from the ankle down to the ball."""
     x, y, z = np.eye(3)
     ground = ankle - d.ankle_height * z
     thick, thin = 0.45 * d.ankle_height, 0.3 * d.ankle_height
 
-    def between(name: str, start: Float, end: Float, sizes: tuple[float, float], m: float, far: bool) -> ConePart:
-        length = float(np.linalg.norm(end - start))
+    def between(name: str, start: Float, end: Float, sizes: tuple[float, float], m: float, far: bool) -> _Part:
+        length = np.linalg.norm(end - start, axis=-1, keepdims=True)
         axis = (end - start) / length
-        frame = _frame(start, axis, np.cross(axis, y))
-        return ConePart(f"{name}_{side}", f"foot_{side}", CONE, (*sizes, length, m), frame, ends=(far, far))
+        frame = _frame(start, axis, cross(axis, y))
+        return _Part(f"{name}_{side}", f"foot_{side}", CONE, _shape(*sizes, length, m), frame, ends=(far, far))
 
     heel, toes = ground + thick * z - 0.2 * d.foot * x, ground + thin * z + 0.8 * d.foot * x
     ball = ground + thick * z + 0.45 * d.foot * x
@@ -290,7 +323,7 @@ def _foot(side: str, ankle: Float, d: BodyDimensions) -> list[ConePart]:
     ]
 
 
-def _trunk_and_head(d: BodyDimensions) -> list[ConePart]:
+def _trunk_and_head(d: BodyDimensions) -> list[_Part]:
     """Return the parts of torso and head: abdomen, belly, chest, shoulders; skull, neck.
 
     At the hips the trunk lies in front of the line of the joints, at the shoulders on it; hair stands on the crown.
@@ -303,14 +336,14 @@ def _trunk_and_head(d: BodyDimensions) -> list[ConePart]:
     hips = (d.hips_half_depth, d.hips_half_width)
     chest = (d.chest_half_depth, d.chest_half_width)
 
-    def slice_of(name: str, low: float, high: float, sizes: tuple[float, float], m: float) -> ConePart:
+    def slice_of(name: str, low: float, high: float, sizes: tuple[float, float], m: float) -> _Part:
         # as far forward as the pelvis up to the waist, on the line at the shoulders
         begin, end = (
             h * z + PELVIS_FORWARD * d.stature * np.clip((shoulders - h) / (shoulders - waist), 0, 1) * x
             for h in (low, high)
         )
-        part = _between(name, "pelvis" if low < 0 else "torso", begin, end, 1.0, m)
-        return replace(part, shape=(*sizes, part.shape[2], m))
+        part = _between(name, "pelvis" if name == "abdomen" else "torso", begin, end, 1.0, m)
+        return part._replace(shape=_shape(*sizes, part.shape[:, 2:3], m))
 
     skull = 0.46 * d.head
     forward = 0.1 * d.head
@@ -323,18 +356,18 @@ def _trunk_and_head(d: BodyDimensions) -> list[ConePart]:
         slice_of("belly", waist, breast, (taper * chest[0], taper * chest[1]), 1 / taper),
         slice_of("chest", breast, shoulders, chest, 0.95),
         slice_of("shoulders", shoulders, d.trunk, (0.85 * chest[0], chest[1]), 0.5),
-        ConePart(
+        _Part(
             "head",
             "head",
             ELLIPSOID,
-            (1.12 * d.head_radius, d.head_radius, skull, 1.0),
+            _shape(1.12 * d.head_radius, d.head_radius, skull, 1.0),
             _frame((crown - skull) * z + forward * x, vertex, face),
         ),
-        ConePart(
+        _Part(
             "neck",
             "head",
             CONE,
-            (d.neck_radius, d.neck_radius, 0.5 * d.head, 0.95),
+            _shape(d.neck_radius, d.neck_radius, 0.5 * d.head, 0.95),
             _frame((d.trunk - 0.15 * d.head) * z + 0.5 * forward * x, z, x),
         ),
     ]
@@ -345,10 +378,13 @@ def group_of(name: str) -> str:
     return name[:-1] if name.endswith(("_l", "_r")) else name
 
 
+def _shape(*sizes: ArrayLike) -> Float:
+    """Return four sizes (N, 1), or numbers, as a shape (N, 4)."""
+    return np.hstack(np.broadcast_arrays(*sizes))
+
+
 def _frame(origin: Float, axis: Float, front: Float) -> Float:
-    """Return the frame (4, 4) at ``origin`` with z along ``axis`` and x along ``front`` (perpendicular to it)."""
-    (a, b, c), (x, y, z) = axis, front
-    T = np.eye(4)
-    T[:3, 0], T[:3, 2], T[:3, 3] = front, axis, origin
-    T[:3, 1] = b * z - c * y, c * x - a * z, a * y - b * x  # np.cross takes ten times as long
+    """Return the frame (N, 4, 4) at ``origin`` (N, 3) with z along ``axis`` and x along ``front`` (perpendicular)."""
+    T = np.tile(np.eye(4), (len(origin), 1, 1))
+    T[:, :3, 0], T[:, :3, 1], T[:, :3, 2], T[:, :3, 3] = front, cross(axis, front), axis, origin
     return T

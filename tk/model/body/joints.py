@@ -49,7 +49,7 @@ class Joint:
     """A row of the table."""
 
     name: str  # with the side, `_l` or `_r`, for a limb's joint
-    # the joint centre in the zero configuration, body frame, left side, metres
+    # the joint centre (..., 3) in the zero configuration, body frame, left side, metres
     place: Callable[[BodyDimensions], Float]
     dofs: tuple[Dof, ...] = ()  # its degrees of freedom, in the order of the pose vector
     above: str = ""  # the joint whose last degree of freedom carries it; empty at the root
@@ -80,7 +80,7 @@ def side_of(name: str) -> str:
 
 
 def _shoulder(d: BodyDimensions) -> Float:
-    return np.array([0.0, d.shoulder_half_width, d.trunk - d.shoulder_drop])
+    return d.shoulder_half_width * _Y + (d.trunk - d.shoulder_drop) * _Z
 
 
 def _elbow(d: BodyDimensions) -> Float:
@@ -88,7 +88,7 @@ def _elbow(d: BodyDimensions) -> Float:
 
 
 def _hip(d: BodyDimensions) -> Float:
-    return np.array([0.0, d.hip_half_width, 0.0])
+    return d.hip_half_width * _Y
 
 
 def _knee(d: BodyDimensions) -> Float:
@@ -100,7 +100,7 @@ def _ankle(d: BodyDimensions) -> Float:
 
 
 def _neck(d: BodyDimensions) -> Float:
-    return np.array([0.0, 0.0, d.trunk])
+    return d.trunk * _Z
 
 
 # Limits in degrees. Active ranges of healthy men with three standard deviations, Boone & Azen, J. Bone Joint Surg. Am.
@@ -124,7 +124,7 @@ _MIDDLE = (
         Dof("x", _X, prismatic=True), Dof("y", _Y, prismatic=True), Dof("z", _Z, prismatic=True),
         Dof("yaw", _Z), Dof("roll", _X, -80.0, 80.0), Dof("pitch", _Y),
     )),
-    Joint("waist", lambda d: np.array([0.0, 0.0, WAIST_HEIGHT * d.trunk]), above="torso", turns="pelvis", dofs=(
+    Joint("waist", lambda d: WAIST_HEIGHT * d.trunk * _Z, above="torso", turns="pelvis", dofs=(
         Dof("roll", _X, -30.0, 30.0, straight_deg=_WAIST_DEG),
         Dof("pitch", -_Y, -25.0, 50.0, straight_deg=_WAIST_DEG),
         Dof("yaw", _Z, -35.0, 35.0, straight_deg=_WAIST_DEG),
@@ -169,7 +169,7 @@ def _on_side(rows: tuple[Joint, ...], side: str) -> tuple[Joint, ...]:
     def sided(row: Joint) -> Joint:
         place, dofs = row.place, row.dofs
         if side == "_r":
-            place = lambda d: mirror @ row.place(d)  # noqa: E731
+            place = lambda d: row.place(d) @ mirror  # noqa: E731
             dofs = tuple(replace(dof, axis=0.0 - mirror @ dof.axis) for dof in dofs)
         names = {name: value + side for name in ("name", "turns", "chain") if (value := getattr(row, name))}
         names |= {name: value + side for name in ("above", "bone_from") if (value := getattr(row, name)) in sided_names}

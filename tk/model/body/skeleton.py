@@ -337,7 +337,8 @@ def build_skeleton(dimensions: BodyDimensions, up: str = "z", paper: bool = Fals
     """Return the skeleton with these dimensions, standing upright along ``up``.
 
     Args:
-        dimensions: lengths, metres.
+        dimensions: lengths, metres. Of N bodies, (N, 1): :attr:`~Skeleton.point`, :attr:`~Skeleton.rise` and
+            :attr:`~Skeleton.joint_position` are (N, ...).
         up: see :func:`up_rotation`.
         paper: whether it has the paper's 24 degrees of freedom only: no waist, no ankles.
     """
@@ -363,8 +364,8 @@ def build_skeleton(dimensions: BodyDimensions, up: str = "z", paper: bool = Fals
     return Skeleton(
         names=tuple(name for _, _, name in dofs),
         axis=axis,
-        point=np.array([row.place(dimensions) for row, _, _ in dofs]) @ B.T,
-        rise=np.array([lift * (name in lifting) for _, _, name in dofs]) @ B.T,
+        point=_rows(row.place(dimensions) for row, _, _ in dofs) @ B.T,
+        rise=_rows(lift * (name in lifting) for _, _, name in dofs) @ B.T,
         prismatic=prismatic,
         parent=np.array(parents, dtype=np.int32),
         lower=np.radians([dof.lower for _, dof, _ in dofs]),
@@ -372,9 +373,14 @@ def build_skeleton(dimensions: BodyDimensions, up: str = "z", paper: bool = Fals
         straight=np.radians([dof.straight_deg for _, dof, _ in dofs]),
         segment_dof=np.array([segment_dof[s] for s in SEGMENTS], dtype=np.int32),
         joint_segment=np.array([SEGMENTS.index(row.carrier) for row in joints], dtype=np.int32),
-        joint_position=np.array([row.place(dimensions) for row in joints]) @ B.T,
+        joint_position=_rows(row.place(dimensions) for row in joints) @ B.T,
         T_world_body=B,
     )
+
+
+def _rows(vectors: Iterable[Float]) -> Float:
+    """Return vectors (..., 3) as rows (..., M, 3)."""
+    return np.stack(np.broadcast_arrays(*vectors), axis=-2)
 
 
 def skeleton_of_names(names: Sequence[str], dimensions: BodyDimensions, up: str) -> Skeleton:
