@@ -140,6 +140,12 @@ def test_two_cameras_that_face_each_other_contradict_no_third(scene: Scene) -> N
         assert bool(used.masks[1].any()) is not excluded
 
 
+def test_sigma_is_unknown_while_the_cameras_left_face_each_other(scene: Scene) -> None:
+    _, estimates, _ = scene.follow(blind([1, 3], range(5, 9)))
+    assert [bool(np.isnan(e.sigma).all()) for e in estimates[:9]] == 5 * [False] + 4 * [True]
+    assert not any(e.status == "lost" for e in estimates)
+
+
 def test_frozen_and_black_cameras_are_excluded_and_reported(scene: Scene) -> None:
     def spoil(frame: Observation) -> Observation:
         images, masks = frame.images.copy(), frame.masks.copy()

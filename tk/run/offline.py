@@ -19,6 +19,8 @@ from tk.io.results.status import Status
 from tk.kernels.projection import pack_cameras
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.bundle import TrackedPoses
+from tk.model.cameras.camera import Rig
+from tk.model.cameras.common_view import determine_depth
 from tk.model.masks.image_health import described
 from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
@@ -260,15 +262,18 @@ class _Finisher:
         sigma, tracked = draft.current("joints/sigma"), ~draft.lost
         suspect = tracked & contradicted(draft.current("residual"), self.task.settings.region.false_alarm)
         unclear = draft.unclear & tracked  # tracking again may have lost frames
-        unknown = tracked & np.isnan(sigma).all(axis=1)
+        known = depth_known(self.cameras.rig, draft.current("joints/position"), draft.current("residual"))
+        unknown = np.isnan(sigma).all(axis=1)
         if second_pass:  # without one, no frame depends on later ones
-            unknown = tracked & high_residual(unknown)
+            unknown = high_residual(unknown & known)
+        unknown = tracked & (unknown | ~known)
         status = draft.current("status")
         status = np.where(status == Status.SUSPECT, np.uint8(Status.TRACKED), status)
         draft.columns["status"] = np.where(suspect | unclear, np.uint8(Status.SUSPECT), status)
         draft.columns["joints/sigma"] = np.where((suspect | unclear | unknown)[:, None], np.nan, sigma)
-        frames = draft.result.frames
-        report_unknown(frames[unknown & ~suspect & ~unclear], self.note)
+        frames, unknown = draft.result.frames, unknown & ~suspect & ~unclear
+        report_one_sided(frames[unknown & ~known], self.note)
+        report_unknown(frames[unknown & known], self.note)
         report_suspect(frames[suspect], self.note)
 
 
@@ -276,6 +281,23 @@ def high_residual(unknown: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return (F,) the frames of stretches with a high residual. The first pass makes sigma unknown, (F,), only after
     :data:`~tk.trackers.region.UNKNOWN_AFTER` of them."""
     return np.array([unknown[i : i + UNKNOWN_AFTER].any() for i in range(len(unknown))], np.bool_)
+
+
+def depth_known(rig: Rig, joints: NDArray[np.float64], residual: NDArray[np.float64] | None) -> NDArray[np.bool_]:
+    """Return (...) whether the cameras that were used, those with a residual (..., C, 2), determine the depth of joints
+    (..., J, 3). Without residuals nothing speaks against it."""
+    used = np.ones((*joints.shape[:-2], len(rig)), np.bool_) if residual is None else np.isfinite(residual[..., 0])
+    return determine_depth(rig.centers, joints.mean(axis=-2), used)
+
+
+def report_one_sided(frames: Sequence[int] | NDArray[np.int64], note: Callable[[str], None]) -> None:
+    """Report frames (F,) whose cameras do not determine depth."""
+    if len(frames):
+        which = described(int(frames[0]), int(frames[-1]), len(frames))
+        note(
+            f"the cameras that are left see the person from the same or from opposite sides: σ is unknown, {which}; "
+            "add a camera from another side, at 30 to 150°"
+        )
 
 
 def report_unknown(frames: Sequence[int] | NDArray[np.int64], note: Callable[[str], None]) -> None:

@@ -20,7 +20,7 @@ from tk.io.results.revision import revise_result
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
 from tk.run.loop import Loop, Output
-from tk.run.offline import finish, report_suspect, report_unknown
+from tk.run.offline import depth_known, finish, report_one_sided, report_suspect, report_unknown
 from tk.run.plan import open_plan, recording_task
 from tk.run.reporter import Reporter
 from tk.run.task import RecordingOptions, Task
@@ -160,17 +160,19 @@ def estimates(task: Task, note: Callable[[str], None] = lambda _: None) -> Itera
         note(line)
     with open_plan(task, note) as plan:
         loop = Loop(plan, note)
-        unknown: defaultdict[int, list[int]] = defaultdict(list)  # by person
-        suspect: defaultdict[int, list[int]] = defaultdict(list)
+        reports = report_one_sided, report_unknown, report_suspect
+        frames: defaultdict[int, tuple[list[int], ...]] = defaultdict(lambda: ([], [], []))  # by person and report
         for estimate in chain.from_iterable(loop.frames()):
+            one_sided, unknown, suspect = frames[estimate.person]
             if estimate.status == "suspect":
-                suspect[estimate.person].append(estimate.frame)
+                suspect.append(estimate.frame)
             found = estimate.status not in ("lost", "absent")
             if found and estimate.sigma is not None and np.isnan(estimate.sigma).all():
-                unknown[estimate.person].append(estimate.frame)
+                known = depth_known(task.setup.rig, estimate.joints, estimate.residual)
+                (unknown if known else one_sided).append(estimate.frame)
             yield estimate
         for line in loop.people.report():
             note(line)
         for person in range(len(loop.people.members)):
-            report_unknown(unknown[person], note)
-            report_suspect(suspect[person], note)
+            for report, numbers in zip(reports, frames[person], strict=True):
+                report(numbers, note)

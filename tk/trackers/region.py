@@ -31,6 +31,7 @@ from tk.model.body.limb_candidates import Limb
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.bundle import CORRELATION_PX
 from tk.model.cameras.camera import Rig
+from tk.model.cameras.common_view import determine_depth
 from tk.model.cues.part_colors import color_bins
 from tk.model.cues.ray_costs import Evidence
 from tk.model.cues.visible_contours import contour_shares
@@ -388,7 +389,7 @@ class RegionTracker(ContourTracker):
 
     def variance(self, pose: Float, curvature: Float, prior: Prior, label: NDArray[np.uint8], residual: Float) -> Float:
         """Return (..., J) variance of the joints' positions along an axis, metres², from the contours' noise and the
-        directions of the views, scaled by the residual.
+        directions of the views, scaled by the residual; NaN if the views used do not determine depth.
 
         Args:
             pose: (..., D).
@@ -404,9 +405,11 @@ class RegionTracker(ContourTracker):
         rays = joints[..., None, :, :] - self.world.rig.centers[:, None]
         rays /= np.sqrt((rays**2).sum(axis=-1, keepdims=True))
         shares = contour_shares(body, self.screen, label, joints)
-        shares = np.where(np.isfinite(residual[..., :1]), shares, 0.0)
-        views = view_variance(rays, shares, self.view_m)
-        return np.asarray((noise + views) * variance_factor(residual)[..., None])
+        used = np.isfinite(residual[..., 0])
+        views = view_variance(rays, np.where(used[..., None], shares, 0.0), self.view_m)
+        known = determine_depth(self.world.rig.centers, joints.mean(axis=-2), used)
+        factor = np.where(known, variance_factor(residual), np.nan)
+        return np.asarray((noise + views) * factor[..., None])
 
     def second_pass(
         self,

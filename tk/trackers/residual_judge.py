@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.cameras.camera import Rig
-from tk.model.cameras.common_view import LEAST_INFORMATION, depth_information
+from tk.model.cameras.common_view import determine_depth
 from tk.model.cues.ray_costs import residual_of
 from tk.trackers.protocol import Estimate, Observation, shows_person, without_cameras
 from tk.trackers.region import RegionTracker
@@ -126,8 +126,7 @@ class ResidualJudge:
         the camera, from ``before`` (C,), by one spread. A pose from two cameras is uncertain, so a third must have
         twice the excess.
         """
-        rays = joints.mean(axis=0) - self._rig.centers[others]
-        if depth_information(rays / np.linalg.norm(rays, axis=1, keepdims=True)) < LEAST_INFORMATION:
+        if not determine_depth(self._rig.centers, joints.mean(axis=0), others):
             return False
         baseline, error = self.tracker.residuals, residual.sum(axis=1)
         excess_of_others = baseline.mean_excess(np.where(others, error, np.nan))

@@ -8,7 +8,14 @@ import pytest
 from tests.io.conftest import look_at
 from tk.errors import VolumeError
 from tk.model.cameras.camera import Camera, Rig
-from tk.model.cameras.common_view import closest_to_axes, infer_volume, sample_box, spread_out, views_of
+from tk.model.cameras.common_view import (
+    closest_to_axes,
+    determine_depth,
+    infer_volume,
+    sample_box,
+    spread_out,
+    views_of,
+)
 from tk.model.cameras.volume import Volume
 
 TARGET = np.array([0.4, -0.3, 1.1])
@@ -28,6 +35,16 @@ def ring(count: int, radius_m: float = 3.0, height_m: float = 0.6, focal_px: flo
 @pytest.mark.parametrize("count", [2, 3, 7])
 def test_axes_meet_at_the_target(count: int) -> None:
     np.testing.assert_allclose(closest_to_axes(ring(count)), TARGET, atol=1e-9)
+
+
+@pytest.mark.parametrize("angle_deg", [10, 24, 26, 90, 154, 156, 175])
+def test_two_cameras_at_25_to_155_degrees_determine_depth(angle_deg: float) -> None:
+    centers = np.array([[np.cos(angle), np.sin(angle), 0.0] for angle in np.radians([0.0, angle_deg, 90.0])])
+    points = np.zeros((2, 3))
+    two, three = np.array([True, True, False]), np.ones(3, np.bool_)
+    assert determine_depth(centers, points, np.stack([two, three])).tolist() == [25 < angle_deg < 155, True]
+    assert not determine_depth(centers, np.full(3, np.nan), three)
+    assert not determine_depth(centers, points[0], np.array([True, False, False]))
 
 
 def test_inferred_volume_bounds_the_common_view() -> None:

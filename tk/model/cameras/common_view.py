@@ -71,6 +71,22 @@ def depth_information(directions: Float) -> float:
     return float(np.linalg.eigvalsh(across.sum(axis=0))[0])
 
 
+def determine_depth(centers: Float, points: Float, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return (...) whether the cameras used have at least :data:`LEAST_INFORMATION` about points.
+
+    Args:
+        centers: (C, 3) of the cameras.
+        points: (..., 3); of one that is not finite nothing is known.
+        used: (..., C).
+    """
+    rays = points[..., None, :] - centers
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
+    total = (across * used[..., None, None]).sum(axis=-3)
+    information = np.linalg.eigvalsh(np.where(np.isfinite(total), total, 0.0))[..., 0]
+    return np.asarray(information >= LEAST_INFORMATION)
+
+
 def view_height(rig: Rig) -> float:
     """Return the height of the cameras' views at the point closest to their axes, the median, in the rig's unit.
 
