@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -197,3 +198,39 @@ def test_sigma_is_unknown_from_the_first_frame_with_a_high_residual_on() -> None
     unknown = np.zeros(20, bool)
     unknown[[12, 13]] = True
     assert np.flatnonzero(finish.high_residual(unknown)).tolist() == list(range(13 - UNKNOWN_AFTER, 14))
+
+
+def judged(displacement: list[float], sigma: float = 0.01, blind: int = 0) -> tuple[Any, list[str]]:
+    """Return the draft, and the notes, of frames with displacements of body and mask in four cameras, of which the
+    last ones saw nobody."""
+    F, notes = len(displacement), list[str]()
+    half = np.array(displacement)[:, None, None] / 2 * np.ones((F, 4, 2))
+    half[:, 4 - blind :] = np.nan
+    columns = {
+        "residual": half,
+        "joints/sigma": np.full((F, 15), sigma),
+        "joints/position": np.zeros((F, 15, 3)),
+        "status": np.zeros(F, np.uint8),
+    }
+    result: Any = SimpleNamespace(frames=np.arange(F), **dict.fromkeys(finish.COLUMNS.values()))
+    draft = finish._Draft(result, np.zeros(F, np.bool_), np.zeros(F, np.bool_), columns)
+    cameras: Any = SimpleNamespace(rig=ring_of_cameras(4, 160, 120))
+    task: Any = SimpleNamespace(settings=Settings())
+    finish._Finisher(Path(), task, True, notes.append, lambda _: None, cameras)._judge(draft, True)
+    return draft, notes
+
+
+def test_all_frames_are_suspect_if_most_are_contradicted() -> None:
+    for count, all_of_them in ((0, False), (10, False), (30, True)):
+        draft, notes = judged(count * [0.5] + (40 - count) * [0.05])
+        suspect = draft.columns["status"] == Status.SUSPECT
+        assert suspect[:count].all() and suspect.all() == all_of_them and suspect[20:].any() == all_of_them
+        assert (np.isnan(draft.columns["joints/sigma"]).all(axis=1) == suspect).all()
+        assert len(notes) == bool(count)
+
+
+def test_cameras_from_opposite_sides_leave_sigma_unknown_and_are_named_as_the_cause() -> None:
+    draft, (note,) = judged(20 * [0.05], blind=3)
+    assert np.isnan(draft.columns["joints/sigma"]).all() and not draft.columns["status"].any()
+    assert "from opposite sides" in note and "frames 0 to 19" in note
+    assert judged(20 * [0.05], blind=2)[1] == []

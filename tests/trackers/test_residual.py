@@ -93,10 +93,10 @@ def test_residual_that_is_high_from_the_first_frame_contradicts_the_pose() -> No
 
 
 def test_second_person_or_torn_mask_contradicts_no_pose() -> None:
-    somebody_else = residuals(0.04, 0.05, frames=40 * RECENT)
+    somebody_else = residuals(0.04, 0.05)
     somebody_else[:, 0, 1] = 0.8
     assert not contradicted(somebody_else, 0.02).any()
-    assert not contradicted(residuals(0.3, 0.01, frames=40 * RECENT), 0.02).any()
+    assert not contradicted(residuals(0.3, 0.01), 0.02).any()
 
 
 def test_only_frames_about_a_lasting_high_residual_are_contradicted() -> None:
@@ -106,12 +106,6 @@ def test_only_frames_about_a_lasting_high_residual_are_contradicted() -> None:
     assert not contradicted(short, 0.02).any()
     found = np.flatnonzero(contradicted(lasting, 0.02))
     assert set(range(5, 11)) <= set(found) <= set(range(2, 14))
-
-
-def test_residual_that_is_somewhat_high_contradicts_the_poses_only_if_it_lasts() -> None:
-    somewhat = residuals(1.05 * LEVEL, 1.05 * LEVEL, frames=40 * RECENT)  # a displacement of 2.1 levels
-    assert contradicted(somewhat, 0.02).all()
-    assert not contradicted(somewhat[: 2 * RECENT], 0.02).any()
 
 
 def test_unmeasured_frames_and_views_do_not_count() -> None:

@@ -258,14 +258,18 @@ class _Finisher:
 
     def _judge(self, draft: _Draft, second_pass: bool) -> None:
         """Mark frames as suspect whose residual contradicts the pose; their sigma is unknown, as it is where the
-        residual is high."""
+        residual is high. If that is most of the frames, what is wrong lasts, such as a calibration, and the body fits
+        the others by chance: all are suspect."""
         sigma, tracked = draft.current("joints/sigma"), ~draft.lost
-        suspect = tracked & contradicted(draft.current("residual"), self.task.settings.region.false_alarm)
+        suspect = tracked.copy()
+        suspect[suspect] = contradicted(draft.current("residual")[suspect], self.task.settings.region.false_alarm)
         unclear = draft.unclear & tracked  # tracking again may have lost frames
         known = depth_known(self.cameras.rig, draft.current("joints/position"), draft.current("residual"))
         unknown = np.isnan(sigma).all(axis=1)
         if second_pass:  # without one, no frame depends on later ones
             unknown = high_residual(unknown & known)
+        if 2 * np.count_nonzero(tracked & known & (suspect | unknown)) > np.count_nonzero(tracked):
+            suspect = tracked
         unknown = tracked & (unknown | ~known)
         status = draft.current("status")
         status = np.where(status == Status.SUSPECT, np.uint8(Status.TRACKED), status)

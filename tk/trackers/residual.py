@@ -32,12 +32,12 @@ RATE = 0.05
 # that a torn mask in one of three or more views makes no frame's residual high. In 2 % of the frames of the development
 # captures a view has a larger excess.
 OUTLIER = 5.0
-# Displacement in the mean over the views, in correct recordings: its mean; the standard deviation of its logarithm
-# between recordings, and within one of the mean over RECENT frames. Measured on walk, dance, fold, cube,
+# Displacement in the mean over the views: mean in correct recordings, standard deviation of its logarithm over RECENT
+# frames (0.30 in one frame, 0.20 between recordings), and this number of frames. Measured on walk, dance, fold, cube,
 # treadmill-slow, rig9, hd and sixteen with all, three and two cameras, in 2600 frames less than 6 cm off: 0.065 to
 # 0.126 in the median of a recording, at most 0.20 over RECENT frames. Another recording's calibration gives 0.25 to
 # 0.6; two of five cameras turned by 3 degrees give 0.15 to 0.6.
-LEVEL, BETWEEN, WITHIN, RECENT = 0.091, 0.20, 0.172, 5
+LEVEL, LEVEL_SPREAD, RECENT = 0.091, 0.264, 5
 # Keeps the logarithm finite where a body fits perfectly; a hundredth of the level.
 _TINY = 1e-3
 
@@ -66,33 +66,21 @@ def variance_factor(residual: Float) -> Float:
 
 
 def contradicted(residual: Float, false_alarm: float) -> NDArray[np.bool_]:
-    """Return (F,) whether residuals (F, V, 2) of consecutive frames contradict the poses.
+    """Return (F,) whether residuals (F, V, 2) of consecutive frames contradict the poses: the frame is among
+    :data:`RECENT` ones whose mean displacement is far above :data:`LEVEL`.
 
-    A frame is contradicted if it belongs to a window of frames whose mean displacement is far above :data:`LEVEL`. The
-    windows have :data:`RECENT` frames, twice as many, and so on up to all frames: the longer the window, the less the
-    mean varies within a recording, and the lower the limit. So one calibration that is wrong throughout marks the
-    frames, too, in which the body happens to fit.
-
-    Most of the variance lies between recordings, so all frames of a recording with a high level would count as
-    contradicted. The limits are therefore set for the probability ``false_alarm`` squared.
+    Half of the logarithm's variance lies between recordings, so all frames of a recording with a high level would count
+    as contradicted. The limit is therefore set for the probability ``false_alarm`` squared.
     """
     log = np.log(displacement(residual) + _TINY)
     measured = np.flatnonzero(np.isfinite(log))
     result = np.zeros(len(residual), np.bool_)
-    deviations = -NormalDist().inv_cdf(false_alarm**2)
-    window = RECENT
-    while len(measured):
-        spread = np.hypot(BETWEEN, WITHIN * np.sqrt(RECENT / window))
-        width = min(window, len(measured))
-        limit = np.log(LEVEL) + deviations * spread
-        mean = np.convolve(log[measured], np.full(width, 1.0 / width), "valid")
+    if len(measured):
+        window = min(RECENT, len(measured))
+        mean = np.convolve(log[measured], np.full(window, 1.0 / window), "valid")
+        limit = np.log(LEVEL) - LEVEL_SPREAD * NormalDist().inv_cdf(false_alarm**2)
         for first in np.flatnonzero(mean > limit):
-            result[measured[first : first + width]] = True
-        if width == len(measured):
-            break
-        if window == RECENT:
-            log = np.minimum(log, limit)  # so that a short contradiction does not mark the frames around it
-        window = min(2 * window, len(measured))
+            result[measured[first : first + window]] = True
     return result
 
 
