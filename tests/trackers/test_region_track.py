@@ -301,7 +301,7 @@ def test_frames_without_known_joints_are_reported(
 
     monkeypatch.setattr(RegionTracker, "step", unsure)
     reporter = Silent()
-    assert run(tiny, tmp_path / "r.h5", reporter, frames=(0, 5), causal=causal).lost == 0
+    assert run(tiny, tmp_path / "r.h5", reporter, frames=(0, 10), causal=causal).lost == 0
     result = read_result(tmp_path / "r.h5")
     assert result.sigma is not None
     first = 2 if causal else 0  # the second pass knows that the residual was high before
@@ -310,7 +310,7 @@ def test_frames_without_known_joints_are_reported(
     assert line.endswith(f"σ is unknown, frames {first} to 3") and line in reporter.notes
     if causal:  # returned estimates are those of the first pass
         notes: list[str] = []
-        assert len(list(estimates(task(tiny, (0, 5)), notes.append))) == 5
+        assert len(list(estimates(task(tiny, (0, 10)), notes.append))) == 10
         assert any(note.endswith("σ is unknown, frames 2 to 3") for note in notes)
 
 
