@@ -6,6 +6,7 @@ import logging
 import re
 import shutil
 import signal
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from tk.io.results.data import Result
 from tk.io.results.reader import read_joints, read_result
 from tk.io.results.status import Status
 from tk.model.body.anthropometry import BodyDimensions
+from tk.model.setup import Subject
 from tk.run.offline import REFINED
 from tk.run.plan import recording_task
 from tk.run.session import Summary, estimates
@@ -312,6 +314,26 @@ def test_frames_without_known_joints_are_reported(
         notes: list[str] = []
         assert len(list(estimates(task(tiny, (0, 10)), notes.append))) == 10
         assert any(note.endswith("σ is unknown, frames 2 to 3") for note in notes)
+
+
+def test_a_person_who_was_tracked_back_to_front_is_tracked_again(
+    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = RegionTracker.start
+
+    def start_turned(tracker: RegionTracker, frames: Sequence[Observation], subject: Subject) -> None:
+        start(tracker, frames, subject)
+        pose = tracker.world.poses_out(tracker.last_poses()[0][None])[0]
+        tracker.start_at(tracker.turned(pose))
+
+    monkeypatch.setattr(RegionTracker, "start", start_turned)
+    errors = []
+    for causal in (True, False):
+        reporter = Silent()
+        run(tiny, tmp_path / f"{causal}.h5", reporter, causal=causal)
+        errors.append(mean_error(read_result(tmp_path / f"{causal}.h5"), tiny))
+        assert any("faces the other way" in note for note in reporter.notes) != causal
+    assert errors[0] > 0.2 and errors[1] < 0.08
 
 
 # --- bodies from files ------------------------------------------------------------------------------------------------

@@ -227,6 +227,23 @@ class TwoPassTracker(Tracker, Protocol):
         """Continue at a pose (D,); forget residuals and hypotheses, keep the body and its colours."""
         ...
 
+    def both_ways(
+        self, masks: Sequence[NDArray[np.uint8]], poses: Float, height_m: float | None
+    ) -> tuple[TwoPassTracker, ...]:
+        """Return trackers whose bodies are fitted to a person who faces as in the poses, and to one who faces the other
+        way; none if the other way explains the frames clearly worse.
+
+        Args:
+            masks: (C, H, W) of N frames, cleaned.
+            poses: (N, D) found in them.
+            height_m: the subject's height, if known.
+        """
+        ...
+
+    def turned(self, pose: Float) -> Float:
+        """Return a pose (D,) that faces the other way, with the limbs in the same places."""
+        ...
+
     def second_pass(
         self,
         masks: Sequence[NDArray[np.uint8]],

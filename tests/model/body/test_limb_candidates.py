@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from tests.model.figures import BODY
 from tk.model.body.gait_poses import standing_pose, walking_pose
-from tk.model.body.limb_candidates import DISTINCT_M, LIMBS, exchanged, limbs_of, pairs
+from tk.model.body.limb_candidates import DISTINCT_M, LIMBS, exchanged, limbs_of, pairs, turned
 from tk.model.body.skeleton import JOINTS
 
 SKELETON = BODY.skeleton
@@ -111,3 +111,19 @@ def test_exchanged_legs_are_at_each_other_s_places_within_the_limits(phase):
     others = np.setdiff1d(np.arange(len(JOINTS)), moved)
     np.testing.assert_allclose(after[others], before[others], atol=1e-12)
     assert (result >= np.minimum(pose, skeleton.lower)).all() and (result <= np.maximum(pose, skeleton.upper)).all()
+
+
+def test_turned_person_leans_as_before_and_has_the_limbs_of_the_other_side_nearby():
+    skeleton, limbs = BODY.skeleton, limbs_of(BODY)
+    pose = walking_pose(skeleton, 0.1)
+    for name, angle in (("torso_roll", 0.2), ("torso_pitch", 0.3), ("waist_roll", 0.1), ("torso_yaw", 0.7)):
+        pose[skeleton.index(name)] = angle
+    before, after = skeleton.joints(pose), skeleton.joints(turned(pose, limbs))
+    other = [JOINTS.index(name[:-1] + {"l": "r", "r": "l"}[name[-1]]) if "_" in name[-2:] else i
+             for i, name in enumerate(JOINTS)]  # fmt: skip
+    distance = np.linalg.norm(after - before[other], axis=1)
+    assert distance[[JOINTS.index(name) for name in ("pelvis", "neck", "shoulder_l", "shoulder_r")]].max() < 0.02
+    assert distance.max() < 0.25  # knees and elbows bend one way
+    front, turned_front = (np.cross(j[JOINTS.index("shoulder_l")] - j[JOINTS.index("shoulder_r")], [0, 0, 1])
+                           for j in (before, after))  # fmt: skip
+    assert front @ turned_front < -0.9 * (front @ front)

@@ -115,10 +115,29 @@ def exchanged(pose: Float, one: Limb, other: Limb) -> Float:
 
     Their angles are exchanged, then corrected by damped Gauss-Newton steps, since the limbs begin at different joints.
     """
-    skeleton, dofs = one.skeleton, np.concatenate([one.dofs, other.dofs])
-    moved, joints = one.joints + other.joints, other.joints + one.joints
-    target, result = skeleton.joints(pose)[joints], pose.copy()
-    result[dofs] = pose[np.concatenate([other.dofs, one.dofs])]
+    result = pose.copy()
+    result[one.dofs], result[other.dofs] = pose[other.dofs], pose[one.dofs]
+    return _placed(result, one, other, one.skeleton.joints(pose)[other.joints + one.joints])
+
+
+def turned(pose: Float, limbs: Sequence[Limb]) -> Float:
+    """Return a pose (D,) that faces the other way: the trunk leans as before, and each limb is at the place of that of
+    the other side, as nearly as the limits allow."""
+    skeleton = limbs[0].skeleton
+    joints, result = skeleton.joints(pose), pose.copy()
+    result[skeleton.index("torso_yaw")] += np.pi
+    leans = [skeleton.index(name) for name in ("torso_roll", "torso_pitch", "waist_roll", "waist_pitch")]
+    result[leans] *= -1.0
+    for one, other in pairs(limbs):
+        result[one.dofs], result[other.dofs] = pose[other.dofs], pose[one.dofs]
+        result = _placed(result, one, other, joints[other.joints + one.joints])
+    return result
+
+
+def _placed(pose: Float, one: Limb, other: Limb, target: Float) -> Float:
+    """Return a pose (D,) whose joints of two limbs are as near to targets (4, 3) as the limits allow."""
+    skeleton, dofs, moved = one.skeleton, np.concatenate([one.dofs, other.dofs]), one.joints + other.joints
+    result = pose.copy()
     for _ in range(_EXCHANGE_STEPS):
         J = skeleton.joint_jacobian(result)[moved][..., dofs].reshape(-1, len(dofs))
         missing = (target - skeleton.joints(result)[moved]).ravel()
