@@ -19,7 +19,7 @@ import tomli_w
 from tests.conftest import FITTED, FRAMES, QUICK, Silent, Tk, track
 from tests.io.conftest import write_picture
 from tests.run.test_session import send
-from tk.commands.track import EXIT_LOST, end
+from tk.commands.track import EXIT_LOST, _expected_error, end
 from tk.errors import ResultError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
@@ -310,6 +310,8 @@ def test_frames_without_known_joints_are_reported(
     assert np.flatnonzero(np.isnan(result.sigma).all(axis=1)).tolist() == list(range(first, 4))
     (line,) = (note for note in result.notes if "σ is unknown" in note)
     assert line.endswith(f"σ is unknown, frames {first} to 3") and line in reporter.notes
+    (text,) = _expected_error(tmp_path / "r.h5")
+    assert text.endswith(f" cm, unknown in {4 - first} frames")
     if causal:  # returned estimates are those of the first pass
         notes: list[str] = []
         assert len(list(estimates(task(tiny, (0, 10)), notes.append))) == 10
@@ -324,7 +326,7 @@ def test_a_person_who_was_tracked_back_to_front_is_tracked_again(
     def start_turned(tracker: RegionTracker, frames: Sequence[Observation], subject: Subject) -> None:
         start(tracker, frames, subject)
         pose = tracker.world.poses_out(tracker.last_poses()[0][None])[0]
-        tracker.start_at(tracker.turned(pose))
+        tracker.start_at(tracker.turned_pose(pose))
 
     monkeypatch.setattr(RegionTracker, "start", start_turned)
     errors = []

@@ -39,9 +39,20 @@ _LOG = logging.getLogger(__name__)
 Float = NDArray[np.float64]
 Note = Callable[[str], None]
 
-# Frames in which a person who faces the other way is compared. With 8, 12 and 20, the decisions about five faults of a
+# Why sigma is unknown, or frames are suspect; with the frames.
+ONE_SIDED = (
+    "the cameras that are left see the person from the same or from opposite sides: σ is unknown, {}; "
+    "add a camera from another side, at 30 to 150°"
+)
+HIGH_RESIDUAL = "the residual is high, and no better pose was found: σ is unknown, {}"
+CONTRADICTED = (
+    "body and masks differ more than in correct recordings: suspect, {}; likely causes: the calibration "
+    "of another recording, moved cameras, or videos of different recordings (see tk inspect)"
+)
+
+# Frames in which the opposite heading is compared. With 8, 12 and 20, the decisions about five faults of a
 # generated recording, two of them tracked back to front, are right in 5, 5 and 4.
-FACING_FRAMES = 12
+HEADING_FRAMES = 12
 
 #: entry in `/model` of a result after the second pass
 REFINED = "refined"
@@ -189,7 +200,7 @@ class _Finisher:
         subject = member.subject
         first = tracker
         if self.alone and subject.init is None:  # a given pose shows where the front is
-            tracker = self._facing_right(tracker, masks, draft, subject.height_m)
+            tracker = self._with_true_heading(tracker, masks, draft, subject.height_m)
         turned = tracker is not first
         tracker, masks = self._with_final_cameras(member, tracker, masks, draft)
         _LOG.info("second pass")
@@ -210,39 +221,39 @@ class _Finisher:
         draft.columns |= {"pose": poses, "residual": residual, "joints/sigma": sigma}
         return tracker
 
-    def _facing_right(
+    def _with_true_heading(
         self, tracker: TwoPassTracker, masks: MaskStore, draft: _Draft, height_m: float | None
     ) -> TwoPassTracker:
-        """Track a person who may face the other way again in both ways; if the other way has the lower residual, keep
-        its result, and return its tracker.
+        """If the opposite heading explains the frames nearly as well, track the person again with both headings; keep
+        the opposite one if it has the lower residual. Return the tracker of the heading that is kept.
 
-        A few views of one who stands upright at the start hardly show where the front is; a whole recording does. Both
-        bodies are fitted to the whole recording, so that neither way has an advantage.
+        A few views of a person who stands upright at the start hardly show where the front is; a whole recording does.
+        Both bodies are fitted to the whole recording, so that neither heading has an advantage.
         """
         rows = np.flatnonzero(~draft.lost)
         if not len(rows) or self.task.source.frame_count is None:
             return tracker
-        rows = rows[np.unique(np.linspace(0, len(rows) - 1, FACING_FRAMES).round().astype(int))]
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, HEADING_FRAMES).round().astype(int))]
         poses, unused = draft.current("pose"), np.isnan(draft.current("residual")[..., 0])
         shown = [np.where(unused[row][:, None, None], 0, masks.get(int(draft.result.frames[row]))) for row in rows]
-        ways = tracker.both_ways(shown, poses[rows], height_m)
-        if not ways:
+        hypotheses = tracker.heading_hypotheses(shown, poses[rows], height_m)
+        if not hypotheses:
             return tracker
-        _LOG.info("tracking a person who may face the other way")
+        _LOG.info("tracking with both headings: which way the person faces is unclear")
         start = poses[np.flatnonzero(draft.result.status != Status.ABSENT)[0]]
-        for way, pose in zip(ways, (start, tracker.turned(start)), strict=True):
-            way.start_at(pose)
-        drafts, seen = self._tracked_by(ways, draft, unused), masks.sequence(draft.result.frames)
+        for hypothesis, pose in zip(hypotheses, (start, tracker.turned_pose(start)), strict=True):
+            hypothesis.start_at(pose)
+        drafts, seen = self._tracked_by(hypotheses, draft, unused), masks.sequence(draft.result.frames)
         residual = []
-        for way, one in zip(ways, drafts, strict=True):
+        for hypothesis, one in zip(hypotheses, drafts, strict=True):
             first = one.current("pose"), one.lost, one.current("residual")
-            residual.append(way.second_pass(seen, *first, height_m, True, self.within)[1].sum(axis=-1))
+            residual.append(hypothesis.second_pass(seen, *first, height_m, True, self.within)[1].sum(axis=-1))
         both = ~(drafts[0].lost | drafts[1].lost)
         if not np.nanmean(residual[1][both]) < np.nanmean(residual[0][both]):
             return tracker
         draft.lost, draft.columns = drafts[1].lost, drafts[1].columns
         self.note("the person faces the other way than the first frames seemed to show: tracked again")
-        return ways[1]
+        return hypotheses[1]
 
     def _tracked_by(self, trackers: Sequence[TwoPassTracker], draft: _Draft, unused: NDArray[np.bool_]) -> list[_Draft]:
         """Track the frames of a draft by trackers that have been started, side by side, without the cameras (F, C) that
@@ -342,9 +353,9 @@ class _Finisher:
         draft.columns["status"] = np.where(suspect | unclear, np.uint8(Status.SUSPECT), status)
         draft.columns["joints/sigma"] = np.where((suspect | unclear | unknown)[:, None], np.nan, sigma)
         frames, unknown = draft.result.frames, unknown & ~suspect & ~unclear
-        report_one_sided(frames[unknown & ~known], self.note)
-        report_unknown(frames[unknown & known], self.note)
-        report_suspect(frames[suspect], self.note)
+        report_frames(ONE_SIDED, frames[unknown & ~known], self.note)
+        report_frames(HIGH_RESIDUAL, frames[unknown & known], self.note)
+        report_frames(CONTRADICTED, frames[suspect], self.note)
 
 
 def high_residual(unknown: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -360,31 +371,10 @@ def depth_known(rig: Rig, joints: NDArray[np.float64], residual: NDArray[np.floa
     return determine_depth(rig.centers, joints.mean(axis=-2), used)
 
 
-def report_one_sided(frames: Sequence[int] | NDArray[np.int64], note: Callable[[str], None]) -> None:
-    """Report frames (F,) whose cameras do not determine depth."""
+def report_frames(text: str, frames: Sequence[int] | NDArray[np.int64], note: Callable[[str], None]) -> None:
+    """Report frames (F,), if there are any, by one of the texts of this module."""
     if len(frames):
-        which = described(int(frames[0]), int(frames[-1]), len(frames))
-        note(
-            f"the cameras that are left see the person from the same or from opposite sides: σ is unknown, {which}; "
-            "add a camera from another side, at 30 to 150°"
-        )
-
-
-def report_unknown(frames: Sequence[int] | NDArray[np.int64], note: Callable[[str], None]) -> None:
-    """Report frames (F,) that are not lost, but without a sigma of any joint."""
-    if len(frames):
-        which = described(int(frames[0]), int(frames[-1]), len(frames))
-        note(f"the residual is high, and no better pose was found: σ is unknown, {which}")
-
-
-def report_suspect(frames: Sequence[int] | NDArray[np.int64], note: Callable[[str], None]) -> None:
-    """Report frames (F,) whose residual contradicts the pose; their sigma is unknown."""
-    if len(frames):
-        which = described(int(frames[0]), int(frames[-1]), len(frames))
-        note(
-            f"body and masks differ more than in correct recordings: suspect, {which}; likely causes: the calibration "
-            "of another recording, moved cameras, or videos of different recordings (see tk inspect)"
-        )
+        note(text.format(described(int(frames[0]), int(frames[-1]), len(frames))))
 
 
 def _columns(body: ConeBody, poses: NDArray[np.float64]) -> dict[str, NDArray[np.floating]]:

@@ -20,7 +20,7 @@ from tk.io.results.revision import revise_result
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
 from tk.run.loop import Loop, Output
-from tk.run.offline import depth_known, finish, report_one_sided, report_suspect, report_unknown
+from tk.run.offline import CONTRADICTED, HIGH_RESIDUAL, ONE_SIDED, depth_known, finish, report_frames
 from tk.run.plan import open_plan, recording_task
 from tk.run.reporter import Reporter
 from tk.run.task import RecordingOptions, Task
@@ -160,8 +160,7 @@ def estimates(task: Task, note: Callable[[str], None] = lambda _: None) -> Itera
         note(line)
     with open_plan(task, note) as plan:
         loop = Loop(plan, note)
-        reports = report_one_sided, report_unknown, report_suspect
-        frames: defaultdict[int, tuple[list[int], ...]] = defaultdict(lambda: ([], [], []))  # by person and report
+        frames: defaultdict[int, tuple[list[int], ...]] = defaultdict(lambda: ([], [], []))  # by person and reason
         for estimate in chain.from_iterable(loop.frames()):
             one_sided, unknown, suspect = frames[estimate.person]
             if estimate.status == "suspect":
@@ -174,5 +173,5 @@ def estimates(task: Task, note: Callable[[str], None] = lambda _: None) -> Itera
         for line in loop.people.report():
             note(line)
         for person in range(len(loop.people.members)):
-            for report, numbers in zip(reports, frames[person], strict=True):
-                report(numbers, note)
+            for text, numbers in zip((ONE_SIDED, HIGH_RESIDUAL, CONTRADICTED), frames[person], strict=True):
+                report_frames(text, numbers, note)

@@ -227,11 +227,11 @@ class TwoPassTracker(Tracker, Protocol):
         """Continue at a pose (D,); forget residuals and hypotheses, keep the body and its colours."""
         ...
 
-    def both_ways(
+    def heading_hypotheses(
         self, masks: Sequence[NDArray[np.uint8]], poses: Float, height_m: float | None
     ) -> tuple[TwoPassTracker, ...]:
-        """Return trackers whose bodies are fitted to a person who faces as in the poses, and to one who faces the other
-        way; none if the other way explains the frames clearly worse.
+        """Return two trackers, whose bodies are fitted to a person with the heading of the poses, and with the opposite
+        one; none if the opposite heading explains the frames clearly worse.
 
         Args:
             masks: (C, H, W) of N frames, cleaned.
@@ -240,8 +240,8 @@ class TwoPassTracker(Tracker, Protocol):
         """
         ...
 
-    def turned(self, pose: Float) -> Float:
-        """Return a pose (D,) that faces the other way, with the limbs in the same places."""
+    def turned_pose(self, pose: Float) -> Float:
+        """Return a pose (D,) with the opposite heading and the limbs in the same places."""
         ...
 
     def second_pass(

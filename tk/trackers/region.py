@@ -69,10 +69,10 @@ PLAIN = 0.25
 # development captures; half and twice the value change the mean errors of dance and cube (50 frames) by 0.04 cm at
 # most (angle) and 0.01 cm (translation).
 ANGLE_DEG, TRANSLATION_M = 40.0, 0.3
-# If a person who faces the other way has less than this multiple of the residual, both ways are tracked. Of walk,
-# dance, fold, cube, punch and kick with all, three and two cameras it is 1.67 to 2.4 in the median of 20 frames; of
-# small pictures of a walk of 14 frames 1.21; of a person with poor masks 1.05, and 1.00 or less back to front.
-BOTH_WAYS = 1.15
+# If the opposite heading has less than this multiple of the residual, the person is tracked with both. Of walk, dance,
+# fold, cube, punch and kick with all, three and two cameras it is 1.67 to 2.4 in the median of 20 frames; of small
+# pictures of a walk of 14 frames 1.21; of a person with poor masks 1.05, and 1.00 or less if back was taken for front.
+AMBIGUOUS_HEADING = 1.15
 # After this many consecutive frames with a high residual, and two failed searches for the person, sigma is set to NaN.
 UNKNOWN_AFTER = 2 * RECOVER_EVERY
 # Masks are searched for carried objects if this share of their pixels has colours that are not the person's; objects
@@ -155,12 +155,12 @@ class RegionTracker(ContourTracker):
         self._fresh = False
         self._reset()
 
-    def turned(self, pose: Float) -> Float:
+    def turned_pose(self, pose: Float) -> Float:
         """See :class:`~tk.trackers.protocol.TwoPassTracker`."""
         inside = turned(self.world.poses_in(pose[None])[0], self.limbs)
         return np.asarray(self.world.poses_out(inside[None])[0])
 
-    def both_ways(
+    def heading_hypotheses(
         self, masks: Sequence[NDArray[np.uint8]], poses: Float, height_m: float | None
     ) -> tuple[RegionTracker, ...]:
         """See :class:`~tk.trackers.protocol.TwoPassTracker`."""
@@ -170,7 +170,7 @@ class RegionTracker(ContourTracker):
             for pyramid, pose in zip(seen, self.world.poses_in(poses), strict=True)
         ])  # fmt: skip
         residual = np.array([self.mean_residual(pyramid, two) for pyramid, two in zip(seen, both, strict=True)])
-        if not np.median(residual[:, 1] / residual[:, 0]) < BOTH_WAYS:
+        if not np.median(residual[:, 1] / residual[:, 0]) < AMBIGUOUS_HEADING:
             return ()
         stature = height_m or self.body.dimensions.stature
         deviation = STATURE_DEVIATION if height_m else STATURE

@@ -191,6 +191,12 @@ JOINTS = tuple(row.name for added in (False, True) for row in TABLE if row.carri
 REQUIRED_JOINTS = tuple(name for name in JOINTS if not ROWS[name].added)
 #: segments of `/segments/rotation`: what the paper's joints turn, then what the others turn
 SEGMENTS = tuple(row.turns for added in (False, True) for row in TABLE if row.turns and row.added_dofs == added)
+#: the degrees of freedom with which the trunk leans
+LEANS = tuple(
+    f"{row.name}_{dof.name}"
+    for row in TABLE if not row.chain
+    for dof in row.dofs if not (dof.prismatic or dof.axis[2])
+)  # fmt: skip
 #: bones of drawings, as pairs of joints
 BONES = tuple((row.bone_from, row.name) for row in TABLE if row.bone_from)
 #: (B, 2) indices of these joints in :data:`JOINTS`

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tk.kernels.cone_arrays import ConeArrays
 from tk.model.body.cone_body import ConeBody
-from tk.model.body.joints import CHAINS, JOINTS, LIMBS
+from tk.model.body.joints import CHAINS, JOINTS, LEANS, LIMBS
 from tk.model.body.skeleton import Skeleton, shoulder_angles
 
 Float = NDArray[np.float64]
@@ -121,13 +121,12 @@ def exchanged(pose: Float, one: Limb, other: Limb) -> Float:
 
 
 def turned(pose: Float, limbs: Sequence[Limb]) -> Float:
-    """Return a pose (D,) that faces the other way: the trunk leans as before, and each limb is at the place of that of
+    """Return a pose (D,) with the opposite heading: the trunk leans as before, and each limb is at the place of that of
     the other side, as nearly as the limits allow."""
     skeleton = limbs[0].skeleton
     joints, result = skeleton.joints(pose), pose.copy()
     result[skeleton.index("torso_yaw")] += np.pi
-    leans = [skeleton.index(name) for name in ("torso_roll", "torso_pitch", "waist_roll", "waist_pitch")]
-    result[leans] *= -1.0
+    result[[skeleton.index(name) for name in LEANS]] *= -1.0
     for one, other in pairs(limbs):
         result[one.dofs], result[other.dofs] = pose[other.dofs], pose[one.dofs]
         result = _placed(result, one, other, joints[other.joints + one.joints])

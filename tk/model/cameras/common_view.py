@@ -58,17 +58,19 @@ def closest_to_lines(origins: Float, directions: Float) -> Float | None:
     return np.linalg.solve(normal, np.einsum("cij,cj->i", across, origins))
 
 
-def depth_information(directions: Float) -> float:
-    """Return how well rays determine a point along the direction that they determine worst.
+def depth_information(directions: Float, used: NDArray[np.bool_] | None = None) -> Float:
+    """Return (...) how well rays determine a point along the direction that they determine worst.
 
     An error of s metres across every ray gives an error of s / √information metres along that direction. Two rays at an
     angle α have 1 − |cos α|.
 
     Args:
-        directions: (N, 3) unit vectors.
+        directions: (..., N, 3) unit vectors; with some that are not finite, nothing is known.
+        used: (..., N) which of them count; None: all.
     """
-    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]  # what a ray determines
-    return float(np.linalg.eigvalsh(across.sum(axis=0))[0])
+    across = np.eye(3) - directions[..., :, None] * directions[..., None, :]  # what a ray determines
+    total = across.sum(axis=-3) if used is None else (across * used[..., None, None]).sum(axis=-3)
+    return np.asarray(np.linalg.eigvalsh(np.where(np.isfinite(total), total, 0.0))[..., 0])
 
 
 def determine_depth(centers: Float, points: Float, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -81,10 +83,7 @@ def determine_depth(centers: Float, points: Float, used: NDArray[np.bool_]) -> N
     """
     rays = points[..., None, :] - centers
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
-    total = (across * used[..., None, None]).sum(axis=-3)
-    information = np.linalg.eigvalsh(np.where(np.isfinite(total), total, 0.0))[..., 0]
-    return np.asarray(information >= LEAST_INFORMATION)
+    return np.asarray(depth_information(rays, used) >= LEAST_INFORMATION)
 
 
 def view_height(rig: Rig) -> float:
