@@ -28,7 +28,7 @@ from scripts.synthetic.capture import write_calibration
 from tk.io.captures.capture import Capture, open_capture
 from tk.model.cameras.camera import Camera, Rig
 from tk.render.video import video_writer
-from tk.report.after import write_video_and_report
+from tk.report.after import film_for, write_video_and_report
 from tk.run import session
 from tk.run.reporter import Silent
 from tk.run.task import RecordingOptions
@@ -133,13 +133,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
         log.addHandler(report)
         log.setLevel(logging.INFO)
         begun = time.perf_counter()
-        done = session.track(capture, Path(scratch) / "loop.h5", RecordingOptions(causal=chosen.causal), report)
+        result = Path(scratch) / "loop.h5"
+        film = film_for(capture, result)
+        done = session.track(capture, result, RecordingOptions(causal=chosen.causal), report, film=film)
         log.removeHandler(report)
         print(
             f"{done.frames} frames in {done.seconds:.0f} s, {done.lost} lost; at the end {held_mib():.1f} MiB, at most "
             f"{peak_mib():.1f}"
         )
-        written = write_video_and_report(capture, Path(scratch) / "loop.h5", print)
+        written = write_video_and_report(capture, result, print, film)
         sizes = ", ".join(f"{path.suffix[1:]} {path.stat().st_size / 1e6:.1f} MB" for path in written)
         print(f"{sizes}, after {time.perf_counter() - begun:.0f} s; at most {peak_mib():.1f} MiB")
 

@@ -1,4 +1,5 @@
-"""What the overlay video and the report cost beside the run that they are of. `python -m scripts.bench --pictures`."""
+"""What the overlay video and the report cost, the images that a run keeps for them included. `python -m scripts.bench
+--pictures`. Each run with them is compared with one without, as with `tk track --no-report`, right after it."""
 
 from __future__ import annotations
 
@@ -6,29 +7,17 @@ import multiprocessing
 import resource
 import tempfile
 import time
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from tk.io.captures.capture import open_capture
-from tk.report.after import write_video_and_report
+from tk.report.after import film_for, write_video_and_report
 from tk.run import session
 from tk.run.reporter import Silent
 from tk.run.task import RecordingOptions
-
-
-@dataclass(frozen=True)
-class Cost:
-    """Seconds of wall time and of processor time, of the run without its pictures and of these."""
-
-    frames: int
-    run: tuple[float, float]
-    pictures: tuple[float, float]
-
-    @property
-    def shares(self) -> list[float]:
-        """Of the pictures in the whole, of wall time and of processor time."""
-        return [pictures / (run + pictures) for run, pictures in zip(self.run, self.pictures, strict=True)]
 
 
 def _clocks() -> tuple[float, float]:
@@ -37,34 +26,44 @@ def _clocks() -> tuple[float, float]:
     return time.perf_counter(), sum(one.ru_utime + one.ru_stime for one in used)
 
 
-def run_once(capture_path: Path, masks: str, frames: int | None, output: Path) -> Cost:
-    """A default run and its pictures; meant for a process of its own."""
+def run_once(
+    capture_path: Path, masks: str, frames: int | None, output: Path, pictures: bool
+) -> tuple[int, float, float]:
+    """Return the frames, the wall time and the processor time, seconds, of a default run; meant for a process of its
+    own."""
     started = _clocks()
     capture = open_capture(capture_path, masks=masks)
-    summary = session.track(capture, output, RecordingOptions(frames=(0, frames)), Silent())
-    tracked = _clocks()
+    film = film_for(capture, output) if pictures else None
+    summary = session.track(capture, output, RecordingOptions(frames=(0, frames)), Silent(), film=film)
     warnings: list[str] = []
-    write_video_and_report(capture, output, warnings.append)
+    if pictures:
+        write_video_and_report(capture, output, warnings.append, film)
     if warnings:
         raise SystemExit(warnings[0])
     done = _clocks()
-    run, pictures = (
-        (after[0] - before[0], after[1] - before[1]) for before, after in ((started, tracked), (tracked, done))
-    )
-    return Cost(summary.frames, run, pictures)
+    return summary.frames, done[0] - started[0], done[1] - started[1]
 
 
 def measure(capture: Path, masks: str, frames: int | None, repeat: int) -> str:
-    """A line on the run with the median share, each in a process of its own."""
-    runs = []
+    """Return a line with the medians over pairs of runs, each run in a process of its own."""
+    count, pairs = 0, []
     with tempfile.TemporaryDirectory() as folder:
         for k in range(repeat):
-            with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as process:
-                runs.append(process.submit(run_once, capture, masks, frames, Path(folder) / f"{k}.h5").result())
-    cost = sorted(runs, key=lambda cost: cost.shares[1])[(len(runs) - 1) // 2]
-    wall, processor = (f"{100 * share:.1f} %" for share in cost.shares)
+            seconds = {}
+            for pictures in (k % 2 == 0, k % 2 != 0):
+                output = Path(folder) / f"{k}-{pictures}.h5"
+                with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as process:
+                    run = process.submit(run_once, capture, masks, frames, output, pictures)
+                    count, *seconds[pictures] = run.result()
+            pairs.append((seconds[True], seconds[False]))
+    return f"{capture.name}, {count} frames: {compared(pairs)}"
+
+
+def compared(pairs: Sequence[tuple[Sequence[float], Sequence[float]]]) -> str:
+    """Return the medians of pairs of runs, with and without pictures: wall time and processor time, seconds."""
+    both, plain = np.median(pairs, axis=0)
+    shares = np.median([100 * (1 - np.divide(without, whole)) for whole, without in pairs], axis=0)
     return (
-        f"{capture.name}: {cost.frames} frames tracked in {cost.run[0]:.1f} s ({cost.run[1]:.1f} s of processors); "
-        f"overlay video and report {cost.pictures[0]:.1f} s ({cost.pictures[1]:.1f} s) more: {wall} of the whole "
-        f"({processor} of the processors' time)"
+        f"{both[0]:.1f} s ({both[1]:.1f} s of processors), without overlay video and report {plain[0]:.1f} s "
+        f"({plain[1]:.1f} s); these take {shares[0]:.1f} % of the whole ({shares[1]:.1f} % of the processors' time)"
     )

@@ -23,6 +23,7 @@ from scripts.synthetic.capture import Options, plan_capture, write_capture
 from tk.errors import TkError
 from tk.io import settings_file
 from tk.io.captures.capture import Capture
+from tk.io.captures.film import Film
 from tk.run.reporter import Reporter
 from tk.run.task import RecordingOptions
 from tk.settings import Settings
@@ -87,12 +88,14 @@ def track(
     reporter: Reporter | None = None,
     resume: bool = False,
     force: bool = False,
+    film: Film | None = None,
     **options: Any,
 ) -> Summary:
     """Track a recording; ``options`` are those of :class:`tk.run.task.RecordingOptions`."""
     from tk.run import session
 
-    return session.track(capture, output, RecordingOptions(settings, **options), reporter or Silent(), resume, force)
+    given = RecordingOptions(settings, **options)
+    return session.track(capture, output, given, reporter or Silent(), resume, force, film)
 
 
 @dataclass(frozen=True)

@@ -5,14 +5,22 @@ from __future__ import annotations
 from pathlib import Path
 
 import av
+import numpy as np
 import pytest
 
-from tests.conftest import Tk
+from tests.conftest import QUICK, Silent, Tk, track
 from tk.errors import ExportError
-from tk.io.captures.capture import open_capture
+from tk.io import settings_file
+from tk.io.captures import film as film_module
+from tk.io.captures.capture import Capture, open_capture
+from tk.io.captures.film import Film
+from tk.io.results.data import UsedCameras
+from tk.io.results.reader import read_result
+from tk.io.results.revision import revise_result
+from tk.render.overlay import Overlay
 from tk.render.video import made_here as is_our_video
 from tk.report import after
-from tk.report.after import write_video_and_report
+from tk.report.after import film_for, write_video_and_report
 from tk.report.page import made_here as is_our_page
 
 
@@ -29,12 +37,83 @@ def test_video_of_a_long_recording_has_its_duration_and_some_of_its_images(
 ) -> None:
     result = tmp_path / "r.h5"
     result.write_bytes(complete.read_bytes())
-    monkeypatch.setattr(after, "_MOST", 5)
+    monkeypatch.setattr(film_module, "_MOST", 5)
     write_video_and_report(open_capture(tiny), result, pytest.fail)
     with av.open(str(tmp_path / "r.mp4")) as video:
         stream = video.streams.video[0]
         assert stream.frames == 5  # 14 frames, every third one
         assert stream.average_rate == 5  # 15 Hz
+
+
+def images_of(video: Path) -> np.ndarray:
+    """Return the images of a video, (T, H, W, 3)."""
+    with av.open(str(video)) as container:
+        return np.array([image.to_ndarray(format="bgr24") for image in container.decode(video=0)], float)
+
+
+def tracked_with_film(capture: Capture, result: Path, settings: str = QUICK) -> Film:
+    """Track frames 1 to 6 causally; return the film."""
+    film = film_for(capture, result)
+    track(capture, result, settings_file.from_toml(settings), film=film, frames=(1, 7), causal=True)
+    assert film is not None
+    return film
+
+
+def refuse(*_: object) -> None:
+    raise AssertionError("decoded a second time")
+
+
+@pytest.mark.parametrize("ahead", [0, 2])
+def test_a_run_keeps_the_images_that_its_video_and_report_show(
+    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ahead: int
+) -> None:
+    monkeypatch.setattr(film_module, "_MOST_PER_S", 8.0)
+    capture, result = open_capture(tiny), tmp_path / "r.h5"
+    film = tracked_with_film(capture, result, QUICK.replace("ahead = 0", f"ahead = {ahead}"))
+    assert list(tmp_path.iterdir()) == [result]
+    write_video_and_report(capture, result, pytest.fail)
+    decoded, page = images_of(tmp_path / "r.mp4"), (tmp_path / "r.html").read_text(encoding="utf-8")
+    monkeypatch.setattr(Overlay, "pictures", refuse)
+    write_video_and_report(capture, result, pytest.fail, film)
+    kept = images_of(tmp_path / "r.mp4")
+    assert kept.shape == decoded.shape and len(kept) == 3  # frames 1, 3, 5
+    assert np.abs(kept - decoded).mean() < 3
+    again = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert again.count('"jpeg":') == page.count('"jpeg":') > 0
+
+
+def test_a_resumed_run_has_a_whole_video(tiny: Path, tmp_path: Path) -> None:
+    capture, result = open_capture(tiny), tmp_path / "r.h5"
+    tracked_with_film(capture, result)
+    film = film_for(capture, result)
+    track(capture, result, settings_file.from_toml(QUICK), film=film, frames=(1, 10), causal=True, resume=True)
+    write_video_and_report(capture, result, pytest.fail, film)
+    assert len(images_of(tmp_path / "r.mp4")) == 9
+
+
+def test_a_run_on_a_full_disk_has_a_whole_video(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(film_module, "LEFT_FREE", 10**18)
+    capture, result, reporter = open_capture(tiny), tmp_path / "r.h5", Silent()
+    film = film_for(capture, result)
+    track(capture, result, settings_file.from_toml(QUICK), reporter, film=film, frames=(1, 7), causal=True)
+    assert ["decoded twice" in note for note in reporter.notes] == [True]
+    write_video_and_report(capture, result, pytest.fail, film)
+    assert len(images_of(tmp_path / "r.mp4")) == 6
+
+
+def test_images_of_other_delays_than_those_that_the_run_has_found_are_decoded(tiny: Path, tmp_path: Path) -> None:
+    capture, result = open_capture(tiny), tmp_path / "r.h5"
+    film = tracked_with_film(capture, result)
+    late = np.array([0, 0, 1, 0]) / capture.fps
+    revise_result(result, cameras=UsedCameras(capture.rig, late))
+    overlay = Overlay(capture, read_result(result), after._WIDEST)
+    _, pictures = after._pictures(overlay, capture, film)
+    with capture.frames(1, 3) as recorded:
+        first, second = (frame.images.copy() for frame in recorded)
+    for frame, images in pictures:
+        if frame == 2:
+            np.testing.assert_array_equal(images[2], first[2])
+            np.testing.assert_array_equal(images[1], second[1])
 
 
 def test_files_of_other_programs_are_not_replaced(complete: Path, tiny: Path, tmp_path: Path) -> None:

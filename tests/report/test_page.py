@@ -160,6 +160,8 @@ def test_images_show_lost_worst_and_typical_frames(complete: Path, tracked: Path
     choices = {choice.row: choice.why for choice in choose_rows(result)}
     assert choices[LOST[0]] == "first lost frame" and choices[11] == "among the worst: mean E_S 30 %"
     assert sum(why.startswith("typical") for why in choices.values()) >= 1
+    some = choose_rows(result, range(1, 14, 3))
+    assert some[0].row == LOST[1] and len(some) > 2 and {choice.row for choice in some} <= {1, 4, 7, 10, 13}
     unknown = choose_rows(read_result(tracked))
     assert len(unknown) == 5 and {choice.why for choice in unknown} == {"spread over the recording"}
 

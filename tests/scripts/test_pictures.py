@@ -30,7 +30,11 @@ def test_cost_of_video_and_report_is_measured(tiny: Path, tmp_path: Path, monkey
         return SimpleNamespace(frames=14)
 
     monkeypatch.setattr("tk.run.session.track", track)
-    cost = bench_pictures.run_once(tiny, "auto", None, tmp_path / "r.h5")
-    assert cost.frames == 14 and min(*cost.run, *cost.pictures) > 0
-    assert cost.shares == pytest.approx([p / (p + r) for p, r in zip(cost.pictures, cost.run, strict=True)])
-    assert {path.name for path in tmp_path.iterdir()} == {"r.h5", "r.mp4", "r.html"}
+    for pictures, files in ((False, {"r.h5"}), (True, {"r.h5", "r.mp4", "r.html"})):
+        frames, wall, processor = bench_pictures.run_once(tiny, "auto", None, tmp_path / "r.h5", pictures)
+        assert frames == 14 and wall > 0 and processor > 0
+        assert {path.name for path in tmp_path.iterdir()} == files
+    assert bench_pictures.compared([((5, 8), (4, 6)), ((10, 8), (8, 6)), ((4, 8), (4, 7))]) == (
+        "5.0 s (8.0 s of processors), without overlay video and report 4.0 s (6.0 s); "
+        "these take 20.0 % of the whole (25.0 % of the processors' time)"
+    )

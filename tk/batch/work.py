@@ -57,23 +57,24 @@ def work(job: Job) -> Outcome:
 def _track(job: Job, reporter: _Reporter) -> Outcome:
     from tk.io.importers import open_recording
     from tk.io.results.reader import read_result
-    from tk.report.after import write_video_and_report
+    from tk.report.after import film_for, write_video_and_report
     from tk.run import session  # heavy; the process that starts the batch does not need it
 
     options = job.options
     capture = open_recording(job.capture, options.cameras, options.masks, options.settings.resample)
+    film = film_for(capture, job.output) if job.pictures else None
     deadline = time.monotonic() + _WAIT_S
     while True:
         reporter.notes.clear()
         try:
-            summary = session.track(capture, job.output, options, reporter, resume=True)
+            summary = session.track(capture, job.output, options, reporter, resume=True, film=film)
             break
         except ResultBusyError:
             if time.monotonic() > deadline:
                 raise
             time.sleep(_RETRY_S)
     if job.pictures:
-        write_video_and_report(capture, job.output, reporter.note)
+        write_video_and_report(capture, job.output, reporter.note, film)
     people = read_result(job.output).people
     known = np.concatenate([person.has_pose for person in people])
     error_cm, limbs_cm = _errors(job, reporter.note)

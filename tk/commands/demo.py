@@ -27,6 +27,7 @@ def demo(output: Path, voxels: int | None, resume: bool, force: bool, no_report:
             from tk.evaluation.joints import evaluate_files
             from tk.io.captures.capture import open_capture
             from tk.io.results.files import check_result_path
+            from tk.report.after import film_for
             from tk.run import session
             from tk.run.task import RecordingOptions
 
@@ -34,9 +35,10 @@ def demo(output: Path, voxels: int | None, resume: bool, force: bool, no_report:
             reporter.stage(f"opening the capture that ships with tk, {folder}")
             options = RecordingOptions(base.load_settings(None, voxels=voxels))
             capture = open_capture(folder)
-            summary = session.track(capture, output, options, reporter, resume, force)
+            film = None if no_report else film_for(capture, output)
+            summary = session.track(capture, output, options, reporter, resume, force, film)
             if not no_report:
-                draw_video_and_report(capture, output, summary, reporter, quiet)
+                draw_video_and_report(capture, output, summary, reporter, quiet, film)
         if not summary.interrupted:
             click.echo(evaluate_files(output, folder / "truth.h5").format_table())
             click.echo(f"The result is in {output}. Try your own recording: tk track CAPTURE -o RESULT.h5")

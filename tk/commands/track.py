@@ -13,6 +13,7 @@ from tk.run.worker import dismiss, started_early
 
 if TYPE_CHECKING:
     from tk.io.captures.capture import Capture
+    from tk.io.captures.film import Film
     from tk.run.session import Summary
 
 #: exit code when more than half of the frames in which the person is present are lost or suspect
@@ -61,6 +62,7 @@ def track(
     with reporter, started_early():
         from tk.io.importers import open_recording
         from tk.io.results.files import check_result_path
+        from tk.report.after import film_for
         from tk.run import session
 
         options = base.recording_options(causal=causal, **given)
@@ -69,9 +71,10 @@ def track(
         check_result_path(output, force, resume)
         reporter.stage(f"opening {capture}")
         opened = open_recording(capture, options.cameras, options.masks, options.settings.resample)
-        summary = session.track(opened, output, options, reporter, resume, force)
+        film = None if no_report else film_for(opened, output)
+        summary = session.track(opened, output, options, reporter, resume, force, film)
         if not no_report:
-            draw_video_and_report(opened, output, summary, reporter, quiet)
+            draw_video_and_report(opened, output, summary, reporter, quiet, film)
     end(output, summary, quiet, as_json)
 
 
@@ -82,7 +85,7 @@ def later_stages(causal: bool, no_report: bool) -> tuple[float, float]:
 
 
 def draw_video_and_report(
-    capture: Capture, result: Path, summary: Summary, reporter: ConsoleReporter, quiet: bool
+    capture: Capture, result: Path, summary: Summary, reporter: ConsoleReporter, quiet: bool, film: Film | None
 ) -> None:
     """Write the overlay video and the report of a run that was not interrupted."""
     if summary.interrupted or not summary.frames:
@@ -91,7 +94,7 @@ def draw_video_and_report(
 
     reporter.stage("drawing the overlay video and the report")
     try:
-        files = write_video_and_report(capture, result, lambda text: click.echo(f"warning: {text}", err=True))
+        files = write_video_and_report(capture, result, lambda text: click.echo(f"warning: {text}", err=True), film)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{result} is complete; tk render and tk report draw it") from None
     if files and not quiet:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -23,6 +23,8 @@ Image = NDArray[np.uint8]
 
 # Appearance only; no measurement depends on these values.
 _FILL = 0.35  # opacity of the body
+#: what a view of points shows, as a multiple of their span: the body may be smaller than the person
+AROUND = 1.2
 #: fractional bits of OpenCV's drawing coordinates
 SUBPIXEL_BITS = 4
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
@@ -45,7 +47,7 @@ class View:
         if not len(xy):
             return View.whole(camera, height)
         low, high = xy.min(axis=0), xy.max(axis=0)
-        span = np.maximum(high - low, 1.0) * 1.2  # margin, because the body may be smaller than the person
+        span = np.maximum(high - low, 1.0) * AROUND
         scale = float(min(width / span[0], height / span[1], 4.0))
         size = np.array([width, height]) / scale
         most = np.array([camera.width, camera.height]) - size
@@ -56,6 +58,14 @@ class View:
     def whole(camera: Camera, height: int) -> View:
         """Return the view of the whole image at this height."""
         return View(np.zeros(2), height / camera.height, round(camera.width * height / camera.height), height)
+
+    def of_size(self, width: float, height: float) -> View:
+        """Return the view of the same part of an image that is reduced to a share of its ``width`` and ``height``."""
+        return (
+            self
+            if width == height == 1
+            else replace(self, origin=self.origin * (width, height), scale=self.scale / width)
+        )
 
     def cut(self, picture: Image, tile: Image) -> None:
         """Fill ``tile`` (height, width, 3) with its part of an image."""

@@ -22,6 +22,7 @@ from tk.io.results.data import Result
 from tk.io.results.reader import truth_of
 from tk.model.cameras.camera import Camera, Rig
 from tk.render.canvas import (
+    AROUND,
     Image,
     View,
     dots,
@@ -68,9 +69,7 @@ class Overlay:
                 f"{result.path}: has frame {last}, but {capture.path} ends with frame {capture.frame_count - 1}; "
                 "name the capture that was tracked"
             )
-        tracked = as_tracked(capture, result)
-        # no tile is wider than the video; a smaller image takes less time to decode and to cut
-        self.capture = tracked.reduced([max(camera.width // widest, 1) for camera in tracked.rig])
+        self.capture = _no_wider(as_tracked(capture, result), widest)
         self.rig = self.capture.rig
         self._errors = [e for person in self.people.results if (e := person.silhouette_error) is not None]
         self.grid = Grid.of(self.rig, widest)
@@ -82,26 +81,30 @@ class Overlay:
         by_frame = () if truth is None else truth.swapaxes(0, 1).reshape(len(result), -1, 3)
         self._truth = dict(zip(result.frames.tolist(), by_frame, strict=False))
 
-    def pictures(self, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield these frames, ascending, and their images (C, H, W, 3); decoding starts immediately."""
+    def pictures(self, frames: Sequence[int]) -> Iterator[tuple[int, Sequence[Image]]]:
+        """Yield these frames, ascending, and their images (C,); decoding starts immediately."""
         reader = self.capture.some_frames(sorted(set(frames)))
+        shapes = [(camera.height, camera.width) for camera in self.rig]
 
-        def taken() -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        def taken() -> Iterator[tuple[int, Sequence[Image]]]:
             with reader:
                 for frame in reader:
-                    yield frame.index, frame.images
+                    yield frame.index, [image[:h, :w] for image, (h, w) in zip(frame.images, shapes, strict=True)]
 
         return taken()
 
     def sheet_row(
         self,
         frame: int,
-        images: NDArray[np.uint8],
+        images: Sequence[Image],
         tile_height: int = 360,
         full: bool = False,
         truth: bool = True,
     ) -> Image:
-        """Return a row of tiles of a frame, one per camera: the part with the person, or the ``full`` images."""
+        """Return a row of tiles of a frame, one per camera: the part with the person, or the ``full`` images.
+
+        The images (C,) may be smaller than the cameras'.
+        """
         row, tiles = self.row_of[frame], []
         people = self._there(row)
         for camera, image in zip(self.rig, images, strict=True):
@@ -135,7 +138,7 @@ class Overlay:
         view: View,
     ) -> None:
         """Fill a tile with a camera's image, and draw bodies and joints over it."""
-        view.cut(image[: camera.height, : camera.width], tile)
+        view.of_size(image.shape[1] / camera.width, image.shape[0] / camera.height).cut(image, tile)
         far = [np.nanmean(np.linalg.norm(figure.joints[row] - camera.center, axis=1)) for figure, _ in people]
         for k in np.argsort(far)[::-1]:
             figure, colors = people[k]
@@ -148,10 +151,10 @@ class Overlay:
     def _true(self, frame: int, camera: Camera) -> list[Float]:
         return [camera.project(self._truth[frame])[0]] if frame in self._truth else []
 
-    def mosaic(self, frame: int, images: NDArray[np.uint8]) -> Image:
+    def mosaic(self, frame: int, images: Sequence[Image]) -> Image:
         """Return the images of all cameras in a grid with the legend below, (H, W, 3), H and W even.
 
-        The next call overwrites the image.
+        The images (C,) may be smaller than the cameras'. The next call overwrites the image.
         """
         grid, row, canvas = self.grid, self.row_of[frame], self._canvas
         people = self._there(row)
@@ -219,6 +222,24 @@ class Grid:
             row * self.cell[0] + max(self.cell[0] - shape[0], 0) // 2,
             column * self.cell[1] + max(self.cell[1] - shape[1], 0) // 2,
         )
+
+
+def sizes_shown(capture: Capture, widest: int) -> list[tuple[int, int]]:
+    """Return the (C,) width and height at which images are shown in a video of width ``widest``: so large that the
+    first subject, standing in the middle of the volume, fills a tile, or the image does."""
+    rig = _no_wider(capture, widest).rig
+    grid, tall = Grid.of(rig, widest), replace(capture.setup(), rig=rig).person_pixels()
+    scales = np.clip(np.maximum(grid.cell[0] / (AROUND * tall), grid.scale), None, 1)
+    scales = 1 / np.where(scales < 0.5, np.floor(1 / scales), 1 / scales)  # whole factors are faster
+    return [
+        (round(camera.width * scale), round(camera.height * scale)) for camera, scale in zip(rig, scales, strict=True)
+    ]
+
+
+def _no_wider(capture: Capture, widest: int) -> Capture:
+    """Return a capture whose images are reduced to the width of a video or a little more. No tile is wider, and a
+    smaller image takes less time to decode and to cut."""
+    return capture.reduced([max(camera.width // widest, 1) for camera in capture.rig])
 
 
 def as_tracked(capture: Capture, result: Result) -> Capture:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,16 +29,19 @@ class Choice:
     why: str
 
 
-def choose_rows(result: Result) -> list[Choice]:
+def choose_rows(result: Result, frames: range | None = None) -> list[Choice]:
     """Return the first frame in which anybody is lost, the worst and typical frames; without E_S, frames spread over
-    the result. Rows are those of :meth:`~tk.io.results.data.Result.aligned`."""
+    the result. Only ``frames``, by default all, are chosen. Rows are those of
+    :meth:`~tk.io.results.data.Result.aligned`."""
     people = result.aligned()
     count = len(people[0])
     there = [np.isfinite(person.joints).any(axis=(1, 2)) for person in people]
     lost = np.any([~person.has_pose & known for person, known in zip(people, there, strict=True)], axis=0)
     error = np.full(count, np.nan)
     by_view = np.concatenate([np.zeros((count, 0)), *(e for p in people if (e := p.silhouette_error) is not None)], 1)
-    known = np.isfinite(by_view).any(axis=1)
+    shown = np.ones(count, np.bool_) if frames is None else np.isin(people[0].frames, frames)
+    lost &= shown
+    known = np.isfinite(by_view).any(axis=1) & shown
     error[known] = np.nanmean(by_view[known], axis=1)
     chosen: dict[int, str] = {}
     spacing = max(2, count // 20)
@@ -59,12 +62,13 @@ def choose_rows(result: Result) -> list[Choice]:
         middle = float(np.nanmedian(error[good]))
         take(good[np.argsort(np.abs(error[good] - middle), kind="stable")], "typical", _TYPICAL)
     else:
-        for row in np.unique(np.linspace(0, count - 1, _WORST + _TYPICAL).astype(int)).tolist():
+        rows = np.flatnonzero(shown)
+        for row in rows[np.unique(np.linspace(0, len(rows) - 1, _WORST + _TYPICAL).astype(int))].tolist():
             chosen.setdefault(row, "spread over the recording")
     return [Choice(row, why) for row, why in chosen.items()]
 
 
-def shot(overlay: Overlay, frame: int, images: NDArray[np.uint8]) -> bytes:
+def shot(overlay: Overlay, frame: int, images: Sequence[NDArray[np.uint8]]) -> bytes:
     """Return a JPEG of a frame with the people in all cameras."""
     height = int(np.clip(_WIDTH / (0.75 * len(overlay.rig)), 160, 300))
     _, data = cv2.imencode(

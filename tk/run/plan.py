@@ -12,6 +12,7 @@ import numpy as np
 
 from tk.errors import CaptureError, ConfigError
 from tk.io.captures.capture import Capture
+from tk.io.captures.film import Film, filmed
 from tk.io.captures.keypoints import first_pose
 from tk.io.captures.source import Source
 from tk.io.results.data import JointAngles, ResultMeta
@@ -182,30 +183,33 @@ class Plan:
 
 
 @contextmanager
-def open_plan(task: Task, note: Callable[[str], None]) -> Iterator[Plan]:
-    """Make trackers and open the source's observations; ``note`` receives lines for the user.
+def open_plan(task: Task, note: Callable[[str], None], film: Film | None = None) -> Iterator[Plan]:
+    """Make trackers and open the source's observations; ``note`` receives lines for the user. A ``film`` is given its
+    frames, those of the video of the result, and their images.
 
     Raises:
         TkError: the options are inconsistent with each other or with the source.
     """
     setup, source, frames = task.setup, task.source, task.options.frames
     kind = tracker_class(task.options.method)
+    start, stop = max(frames[0], source.first_frame), frames[1]
+    if source.frame_count is not None:
+        start, stop = choose_frames(source, frames, note)
+    first = min(s.init_frame for s in setup.subjects)
+    if not any(s.init or s.in_init_pose for s in setup.subjects):
+        first = max(first, start)  # no pose is given, so any frame may serve
+    if stop is not None and first >= stop:
+        raise ConfigError(
+            f"frames {start}:{stop}: the subject is found in frame {first} and followed forwards; "
+            f"end after frame {first}, or give an initial pose in another frame",
+            hint="with --init-pose FILE",
+        )
+    if start < first:
+        note(f"frames before {first} are left out: the subject is found in frame {first} and followed forwards")
+    begin = max(start, first)
+    if film is not None and stop is not None:
+        film.frames = filmed(begin, stop, setup.fps)
     # the process of the observations starts while this one makes tables and compiles
-    with open_observations(task, note, kind.needs_images) as observations:
+    with open_observations(task, note, kind.needs_images, film) as observations:
         _LOG.info("preparing the %s tracker", task.options.method)
-        tracker = kind.of(setup, task.settings)
-        start, stop = max(frames[0], source.first_frame), frames[1]
-        if source.frame_count is not None:
-            start, stop = choose_frames(source, frames, note)
-        first = min(s.init_frame for s in setup.subjects)
-        if not any(s.init or s.in_init_pose for s in setup.subjects):
-            first = max(first, start)  # no pose is given, so any frame may serve
-        if stop is not None and first >= stop:
-            raise ConfigError(
-                f"frames {start}:{stop}: the subject is found in frame {first} and followed forwards; "
-                f"end after frame {first}, or give an initial pose in another frame",
-                hint="with --init-pose FILE",
-            )
-        if start < first:
-            note(f"frames before {first} are left out: the subject is found in frame {first} and followed forwards")
-        yield Plan(task, observations, tracker, first, max(start, first), stop)
+        yield Plan(task, observations, kind.of(setup, task.settings), first, begin, stop)

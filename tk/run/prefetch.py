@@ -4,7 +4,7 @@ A thread would not do: Taichi's launches hold the interpreter, so the tracker wo
 process is a fresh interpreter (a fork would hang in Taichi, and multiprocessing's spawn imports the user's script
 again). Messages pass through a socket, frames through memory that both processes map, divided into slots of one frame:
 
-    tracker ── task, span of frames, numbers of free slots ──► process
+    tracker ── task, span of frames, numbers of free slots ──► process ──► small images (tk.io.captures.film)
             ◄── _Ready: number of a slot with a frame, notes, _Failed, None after the last frame ──
 
 The memory has no name, so the system frees it when both processes have ended, however they end. When the tracker ends,
@@ -28,8 +28,8 @@ import time
 import traceback
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Protocol
@@ -39,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import TkError, WorkerError
-from tk.io.captures.source import Source
+from tk.io.captures.film import Film
 from tk.kernels.runtime import ensure_runtime
 from tk.model.cameras.camera import Rig
 from tk.run import worker
@@ -61,7 +61,7 @@ _HELD = 2
 _SPARE = 42
 #: most bytes of the frames made ahead: a few of eight full-HD cameras. Fewer would make the process wait.
 _AHEAD_BYTES = 400_000_000
-_HANDLE = b"memory"  # goes with the descriptor of the memory that both processes share
+_HANDLES = b"memory, film"  # goes with the descriptors of the memory that both processes share, and of the film
 #: seconds in which the process may end by itself. A shorter time would lose kernels that it has compiled.
 _PATIENCE_S = 5.0
 
@@ -84,13 +84,14 @@ class Observations(Protocol):
     ) -> None: ...
 
 
-def open_observations(task: Task, note: Note, keep_images: bool = True) -> Observations:
+def open_observations(task: Task, note: Note, keep_images: bool = True, film: Film | None = None) -> Observations:
     """Return the observations of a source, made ahead if there is a second core and ``settings.ahead`` is not 0.
 
     Args:
         task: its source yields the frames.
         note: called with each line that the user should read.
         keep_images: False leaves the images empty, (C, 0, 0, 3), and no uncertain pixels, for a tracker of masks alone.
+        film: takes small images of the frames.
 
     Raises:
         CaptureError: there is nothing to make masks from.
@@ -98,13 +99,13 @@ def open_observations(task: Task, note: Note, keep_images: bool = True) -> Obser
     mask_source(task.source)  # before a process is started
     if task.settings.ahead and worker.cores() > 1 and sys.executable and _can_be_sent(task.source.segmenter):
         try:
-            return Ahead(task, note, keep_images)
+            return Ahead(task, note, keep_images, film)
         except OSError as error:  # ulimit -f, -n or -v
             note(
                 f"no memory can be shared with another process ({error.strerror}): frames are made one after the other"
             )
     worker.dismiss()
-    return Serial(task, note, keep_images)
+    return Serial(task, note, keep_images, film)
 
 
 def _can_be_sent(segmenter: Segmenter | None) -> bool:
@@ -117,15 +118,18 @@ def _can_be_sent(segmenter: Segmenter | None) -> bool:
 
 
 def observe(
-    source: Source, label: Labeller, span: tuple[int, int | None], keep_images: bool
+    task: Task, label: Labeller, note: Note, span: tuple[int, int | None], keep_images: bool, film: Film | None
 ) -> Iterator[tuple[Observation, Stopwatch]]:
     """Decode and segment frames in this process; ``span``: first frame, and the end, exclusive."""
-    with source.frames(*span) as frames:
+    shapes = [(camera.height, camera.width) for camera in task.setup.rig]
+    with task.source.frames(*span) as frames:
         while True:
             watch = Stopwatch()
             frame = next(frames, None)
             if frame is None:
                 return
+            if film is not None:
+                film.put(frame.index, [image[:h, :w] for image, (h, w) in zip(frame.images, shapes, strict=True)], note)
             watch.lap("decode")
             masks, uncertain, sources = label(frame)
             images = frame.images if keep_images else np.empty((len(masks), 0, 0, 3), np.uint8)
@@ -143,10 +147,12 @@ class Serial:
     task: Task
     note: Note
     keep_images: bool = True
+    film: Film | None = None
 
     def frames(self, start: int, stop: int | None) -> Iterator[Observed]:
         label = make_labeller(self.task, self.note)
-        for observation, watch in observe(self.task.source, label, (start, stop), self.keep_images):
+        span = start, stop
+        for observation, watch in observe(self.task, label, self.note, span, self.keep_images, self.film):
             yield observation, {**watch.laps, "wait": sum(watch.laps.values())}
 
     def __enter__(self) -> Serial:
@@ -166,6 +172,7 @@ class _Order:
     task: Task
     keep_images: bool
     slots: int
+    film: Film | None
 
 
 @dataclass(frozen=True)
@@ -226,7 +233,7 @@ class Ahead:
     it receives, the tracker gives the process a free slot, so the process always has ``settings.ahead`` of them.
     """
 
-    def __init__(self, task: Task, note: Note, keep_images: bool = True) -> None:
+    def __init__(self, task: Task, note: Note, keep_images: bool = True, film: Film | None = None) -> None:
         self._where, self._note = task.source.where, note
         self._layout = _Layout(task.setup.rig, keep_images)
         slots = max(min(task.settings.ahead, _AHEAD_BYTES // self._layout.bytes), 1)
@@ -240,11 +247,11 @@ class Ahead:
             started = worker.take()
             self._process = started.process
             with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-                socket.send_fds(started.end, [_HANDLE], [handle])
+                socket.send_fds(started.end, [_HANDLES], [handle] if film is None else [handle, film.handle])
         finally:
             os.close(handle)
         self._connection = Connection(started.end.detach())
-        self._send(_Order(task, keep_images, slots))
+        self._send(_Order(task, keep_images, slots, film))
 
     def frames(self, start: int, stop: int | None) -> Iterator[Observed]:
         self._begun = True
@@ -377,7 +384,7 @@ def serve(descriptor: int) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # may be sent to all processes of a job; the tracker ends this one
     with socket.socket(fileno=descriptor) as end:
         _warm_up(end)
-        _, handles, _, _ = socket.recv_fds(end, len(_HANDLE), 1)
+        _, handles, _, _ = socket.recv_fds(end, len(_HANDLES), 2)
         if not handles:
             return  # the tracker has ended
         connection = end.detach()
@@ -386,7 +393,7 @@ def serve(descriptor: int) -> None:
         # the tracker closed its end of the socket
         with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
             try:
-                _serve(tracker, memory)
+                _serve(tracker, memory, handles[1:])
             except (EOFError, BrokenPipeError, ConnectionResetError):
                 raise
             except TkError as error:
@@ -403,11 +410,12 @@ def _warm_up(end: socket.socket) -> None:
         step()
 
 
-def _serve(tracker: Connection, memory: mmap.mmap) -> None:
+def _serve(tracker: Connection, memory: mmap.mmap, film_handle: Sequence[int]) -> None:
     order: _Order = tracker.recv()
+    film = replace(order.film, handle=film_handle[0]) if order.film else None
     label = make_labeller(order.task, tracker.send)
     slots = _Slots(tracker, memory, order)
     span: tuple[int, int | None] = tracker.recv()
-    for observation, watch in observe(order.task.source, label, span, order.keep_images):
+    for observation, watch in observe(order.task, label, tracker.send, span, order.keep_images, film):
         slots.put(observation, watch)
     tracker.send(None)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.io.captures.capture import Capture
+from tk.io.captures.film import Film
 from tk.io.captures.mask_store import MaskStores
 from tk.io.results.files import check_result_path
 from tk.io.results.reader import read_people
@@ -74,6 +75,7 @@ def track(
     reporter: Reporter,
     resume: bool = False,
     force: bool = False,
+    film: Film | None = None,
 ) -> Summary:
     """Track a recording and write the result, see :func:`track_task`.
 
@@ -83,10 +85,17 @@ def track(
     masks = Path(capture.masks) if capture.masks not in ("auto", "none", "median") else None
     inputs = [options.init_pose, capture.init_keypoints, options.body, masks]
     check_result_path(output, force, resume, inputs, capture.path)
-    return track_task(recording_task(capture, options), output, reporter, resume, force)
+    return track_task(recording_task(capture, options), output, reporter, resume, force, film)
 
 
-def track_task(task: Task, output: Path, reporter: Reporter, resume: bool = False, force: bool = False) -> Summary:
+def track_task(
+    task: Task,
+    output: Path,
+    reporter: Reporter,
+    resume: bool = False,
+    force: bool = False,
+    film: Film | None = None,
+) -> Summary:
     """Track the people in a scene and write the result, frame by frame.
 
     People are found in the frame of the initialisation and tracked forwards; frames before ``task.options.frames`` are
@@ -98,11 +107,14 @@ def track_task(task: Task, output: Path, reporter: Reporter, resume: bool = Fals
         reporter: receives notes and progress.
         resume: continue where an earlier run of the same command stopped.
         force: replace an existing result.
+        film: takes small images of the frames, unless an earlier run has tracked some of them.
 
     Raises:
         TkError: bad input; every frame finished before it is in the file.
     """
     check_result_path(output, force, resume)
+    if resume and output.exists():
+        film = None
     said: list[str] = []
     causal = task.options.causal
 
@@ -112,7 +124,7 @@ def track_task(task: Task, output: Path, reporter: Reporter, resume: bool = Fals
 
     for text in task.notes:
         note(text)
-    with open_plan(task, note) as plan:
+    with open_plan(task, note, film) as plan:
         meta = plan.meta()
         writer, done = ResultWriter.resume(output, meta) if resume else (ResultWriter.create(output, meta), 0)
         again = not causal and plan.tracker.has_second_pass  # the second pass needs the masks

@@ -1,0 +1,132 @@
+"""A film: small images of some frames, kept while a run decodes its videos, so that drawing them needs no second time.
+
+The images are JPEG in a file without a name in the result's folder: nothing remains of it however the processes end.
+The process that decodes the frames writes it; the process that tracks reads it afterwards.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+import weakref
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.io.captures.clip import Image
+
+# Most frames of a second, and in all: every run pays the time for them.
+_MOST_PER_S, _MOST = 15.0, 3000
+# Appearance only: 30 kB for 430×320.
+_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 90)
+#: bytes on the disk that are left to the result and its masks
+LEFT_FREE = 1_000_000_000
+# frames that are decoded ahead
+_AHEAD = 4
+
+
+def filmed(begin: int, stop: int, fps: float) -> range:
+    """Return the frames of a result, ``begin`` to ``stop`` - 1, that its video shows."""
+    step = max(math.ceil(fps / _MOST_PER_S - 0.01), -(-(stop - begin) // _MOST))
+    return range(begin, stop, step)
+
+
+@dataclass
+class Film:
+    """The images of :attr:`frames`. Another process continues it with a ``handle`` of its own.
+
+    Attributes:
+        where: the folder, as messages name it.
+        sizes: (C,) width and height of the images. Smaller ones are kept as they are.
+        handle: descriptor of the file.
+        frames: which frames are kept; none until a run has chosen them.
+    """
+
+    where: Path
+    sizes: Sequence[tuple[int, int]]
+    handle: int
+    frames: range = range(0)
+    _end: int = field(default=0, init=False)  # bytes written
+
+    @staticmethod
+    def in_folder(folder: Path, sizes: Sequence[tuple[int, int]]) -> Film | None:
+        """Return a film in a folder; None if no file can be made there."""
+        try:
+            with tempfile.TemporaryFile(dir=folder) as file:
+                film = Film(folder, sizes, os.dup(file.fileno()))
+        except OSError:
+            return None
+        weakref.finalize(film, os.close, film.handle)
+        return film
+
+    def put(self, index: int, images: Sequence[Image], note: Callable[[str], None]) -> None:
+        """Keep the images (C,) of a frame if it is one of :attr:`frames`. If the disk is full, ``note`` receives a
+        line, and the film ends."""
+        if index not in self.frames:
+            return
+        coded = [_coded(image, size) for image, size in zip(images, self.sizes, strict=True)]
+        record = b"".join([_head(index, [len(each) for each in coded]).tobytes(), *coded])
+        try:
+            space = os.fstatvfs(self.handle)
+            if space.f_bavail * space.f_frsize < LEFT_FREE + len(record):
+                raise OSError(f"less than {LEFT_FREE / 1e9:g} GB is free")
+            if os.pwrite(self.handle, record, self._end) < len(record):
+                raise OSError("it is full")
+        except OSError as error:
+            self.frames = range(0)
+            os.ftruncate(self.handle, 0)
+            reason = error.strerror or error
+            note(f"{self.where}: no small images can be kept there ({reason}): the videos are decoded twice")
+            return
+        self._end += len(record)
+
+    def places(self) -> dict[int, NDArray[np.int64]]:
+        """Return the frames in the file, and where the images of each begin and end, (C + 1,) bytes."""
+        found, end, whole = dict[int, NDArray[np.int64]](), 0, os.fstat(self.handle).st_size
+        size = _head(0, [0] * len(self.sizes)).nbytes
+        while end + size <= whole:
+            index, *sizes = np.frombuffer(os.pread(self.handle, size, end), np.int64)
+            bounds = end + size + np.cumsum([0, *sizes])
+            end = int(bounds[-1])
+            if end <= whole:  # else the process was killed while it wrote
+                found[int(index)] = bounds
+        return found
+
+    def images(self, frames: Iterable[int]) -> Iterator[tuple[int, list[Image]]]:
+        """Yield these frames, which must be in the file, and their images (C,), BGR; decoded ahead."""
+        places = self.places()
+        with ThreadPoolExecutor(1) as thread:
+            coming = deque[tuple[int, Callable[[], list[Image]]]]()
+            for frame in frames:
+                coming.append((frame, thread.submit(self._read, places[frame]).result))
+                if len(coming) > _AHEAD:
+                    frame, result = coming.popleft()
+                    yield frame, result()
+            for frame, result in coming:
+                yield frame, result()
+
+    def _read(self, bounds: NDArray[np.int64]) -> list[Image]:
+        record = np.frombuffer(os.pread(self.handle, int(bounds[-1] - bounds[0]), int(bounds[0])), np.uint8)
+        coded = np.split(record, bounds[1:-1] - bounds[0])
+        return [np.asarray(cv2.imdecode(each, cv2.IMREAD_COLOR), np.uint8) for each in coded]
+
+
+def _head(index: int, sizes: Sequence[int]) -> NDArray[np.int64]:
+    """Return what precedes the images (C,) of a frame: its number, and the images' bytes."""
+    return np.array([index, *sizes], np.int64)
+
+
+def _coded(image: Image, size: tuple[int, int]) -> bytes:
+    """Return an image as JPEG, at a size if it is larger."""
+    if size[0] < image.shape[1]:
+        # down to half the size, linear interpolation uses every pixel, and takes a fifth of the time
+        method = cv2.INTER_LINEAR if 2 * size[0] > image.shape[1] else cv2.INTER_AREA
+        image = np.asarray(cv2.resize(image, size, interpolation=method), np.uint8)
+    return cv2.imencode(".jpg", image, _JPEG)[1].tobytes()
