@@ -37,7 +37,11 @@ def film(tmp_path: Path) -> Film:
 IMAGES = {k: [scene(k, (80, 120)), scene(k + 100, (70, 100))] for k in range(2, 9)}
 
 
-def test_images_of_the_chosen_frames_are_kept_small(film: Film, tmp_path: Path) -> None:
+@pytest.mark.parametrize("plain", [True, False])
+def test_images_of_the_chosen_frames_are_kept_small(
+    film: Film, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plain: bool
+) -> None:
+    monkeypatch.setattr(film_module, "_PLAIN", 3 * 3 * (60 * 40 + 100 * 70) if plain else 0)
     for index, images in IMAGES.items():
         film.put(index, images, nobody)
     assert not list(tmp_path.iterdir()), "nothing remains, however the process ends"
@@ -47,6 +51,7 @@ def test_images_of_the_chosen_frames_are_kept_small(film: Film, tmp_path: Path) 
         expected = cv2.resize(IMAGES[index][0], (60, 40), interpolation=cv2.INTER_AREA)
         assert first.shape == (40, 60, 3) and np.abs(first.astype(int) - expected).mean() < 3
         assert second.shape == (70, 100, 3) and np.abs(second.astype(int) - IMAGES[index][1]).mean() < 3
+        assert np.array_equal(second, IMAGES[index][1]) == plain
 
 
 def test_another_process_continues_the_film(film: Film) -> None:
@@ -74,14 +79,14 @@ def test_room_is_left_on_the_disk(film: Film, tmp_path: Path, monkeypatch: pytes
 
 def test_a_full_disk_ends_the_film(film: Film, monkeypatch: pytest.MonkeyPatch) -> None:
     notes: list[str] = []
-    write = os.pwrite
+    write = os.pwritev
 
-    def full(handle: int, data: bytes, place: int) -> int:
+    def full(handle: int, data: list[memoryview], place: int) -> int:
         if place:
             raise OSError(errno.EDQUOT, os.strerror(errno.EDQUOT))
         return write(handle, data, place)
 
-    monkeypatch.setattr(film_module.os, "pwrite", full)
+    monkeypatch.setattr(film_module.os, "pwritev", full)
     for index, images in IMAGES.items():
         film.put(index, images, notes.append)
     assert len(notes) == 1 and os.strerror(errno.EDQUOT) in notes[0] and not film.places()

@@ -1,7 +1,8 @@
 """A film: small images of some frames, kept while a run decodes its videos, so that drawing them needs no second time.
 
-The images are JPEG in a file without a name in the result's folder: nothing remains of it however the processes end.
-The process that decodes the frames writes it; the process that tracks reads it afterwards.
+The images are in a file without a name in the result's folder: nothing remains of it however the processes end. The
+process that decodes the frames writes it; the process that tracks reads it afterwards. Images of a long recording are
+compressed. Those of a short one are not, and most systems delete them before they have written them to the disk.
 """
 
 from __future__ import annotations
@@ -24,8 +25,10 @@ from tk.io.captures.clip import Image
 
 # Most frames of a second, and in all: every run pays the time for them.
 _MOST_PER_S, _MOST = 15.0, 3000
-# Appearance only: 30 kB for 430×320.
-_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 90)
+# Bytes of all images above which they become JPEG, a tenth of the size. For 5 images of 430×320 that takes 6 ms, a
+# third of what their frame of the video takes in all.
+_PLAIN = 500_000_000
+_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 90)  # appearance only
 #: bytes on the disk that are left to the result and its masks
 LEFT_FREE = 1_000_000_000
 # frames that are decoded ahead
@@ -44,7 +47,7 @@ class Film:
 
     Attributes:
         where: the folder, as messages name it.
-        sizes: (C,) width and height of the images. Smaller ones are kept as they are.
+        sizes: (C,) width and height of the images.
         handle: descriptor of the file.
         frames: which frames are kept; none until a run has chosen them.
     """
@@ -71,13 +74,15 @@ class Film:
         line, and the film ends."""
         if index not in self.frames:
             return
-        coded = [_coded(image, size) for image, size in zip(images, self.sizes, strict=True)]
-        record = b"".join([_head(index, [len(each) for each in coded]).tobytes(), *coded])
+        small = [_resized(image, size) for image, size in zip(images, self.sizes, strict=True)]
+        coded = [image if self._plain else cv2.imencode(".jpg", image, _JPEG)[1] for image in small]
+        record = [_head(index, [each.nbytes for each in coded]), *coded]
+        size = sum(part.nbytes for part in record)
         try:
             space = os.fstatvfs(self.handle)
-            if space.f_bavail * space.f_frsize < LEFT_FREE + len(record):
+            if space.f_bavail * space.f_frsize < LEFT_FREE + size:
                 raise OSError(f"less than {LEFT_FREE / 1e9:g} GB is free")
-            if os.pwrite(self.handle, record, self._end) < len(record):
+            if os.pwritev(self.handle, [part.data for part in record], self._end) < size:
                 raise OSError("it is full")
         except OSError as error:
             self.frames = range(0)
@@ -85,7 +90,7 @@ class Film:
             reason = error.strerror or error
             note(f"{self.where}: no small images can be kept there ({reason}): the videos are decoded twice")
             return
-        self._end += len(record)
+        self._end += size
 
     def places(self) -> dict[int, NDArray[np.int64]]:
         """Return the frames in the file, and where the images of each begin and end, (C + 1,) bytes."""
@@ -115,7 +120,13 @@ class Film:
     def _read(self, bounds: NDArray[np.int64]) -> list[Image]:
         record = np.frombuffer(os.pread(self.handle, int(bounds[-1] - bounds[0]), int(bounds[0])), np.uint8)
         coded = np.split(record, bounds[1:-1] - bounds[0])
+        if self._plain:
+            return [image.reshape(height, width, 3) for image, (width, height) in zip(coded, self.sizes, strict=True)]
         return [np.asarray(cv2.imdecode(each, cv2.IMREAD_COLOR), np.uint8) for each in coded]
+
+    @property
+    def _plain(self) -> bool:
+        return len(self.frames) * sum(3 * width * height for width, height in self.sizes) <= _PLAIN
 
 
 def _head(index: int, sizes: Sequence[int]) -> NDArray[np.int64]:
@@ -123,10 +134,9 @@ def _head(index: int, sizes: Sequence[int]) -> NDArray[np.int64]:
     return np.array([index, *sizes], np.int64)
 
 
-def _coded(image: Image, size: tuple[int, int]) -> bytes:
-    """Return an image as JPEG, at a size if it is larger."""
-    if size[0] < image.shape[1]:
-        # down to half the size, linear interpolation uses every pixel, and takes a fifth of the time
-        method = cv2.INTER_LINEAR if 2 * size[0] > image.shape[1] else cv2.INTER_AREA
-        image = np.asarray(cv2.resize(image, size, interpolation=method), np.uint8)
-    return cv2.imencode(".jpg", image, _JPEG)[1].tobytes()
+def _resized(image: Image, size: tuple[int, int]) -> Image:
+    if size == image.shape[1::-1]:
+        return np.ascontiguousarray(image)
+    # down to half the size, linear interpolation uses every pixel, and takes a fifth of the time
+    method = cv2.INTER_LINEAR if 2 * size[0] > image.shape[1] else cv2.INTER_AREA
+    return np.asarray(cv2.resize(image, size, interpolation=method), np.uint8)
