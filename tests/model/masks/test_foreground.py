@@ -115,6 +115,18 @@ def test_a_sleeve_slightly_brighter_than_the_floor_is_found():
     assert iou(masks[0], truth[0] | sleeve[0]) > 0.9
 
 
+def test_noise_does_not_hide_a_sleeve_of_nearly_the_walls_colour():
+    rng = np.random.default_rng(12)
+    scene, clips = background(rng, noise=2.0)
+    image, truth = with_person(scene, (40, 40, 200))
+    sleeve = np.zeros_like(truth)
+    sleeve[0, 40:54, 85:125] = True
+    image[sleeve] = scene[sleeve] + np.array([-20.0, 20.0, 20.0])
+    masks = CollinearityForeground.learn(clips, SHAPE, SIZES).label(expose(image, rng, noise=25.0))[0]
+    assert np.mean(masks[sleeve] > 0) > 0.8
+    assert iou(masks[0], truth[0] | sleeve[0]) > 0.85
+
+
 def test_masks_of_the_empty_scene_are_empty(learned):
     scene, _, foreground = learned
     for seed in range(3):

@@ -77,6 +77,15 @@ def test_image_without_details_has_no_shift(levels: float) -> None:
     assert shifts[0] == 0.0 and np.isnan(shifts[1:]).all()
 
 
+def test_noise_moves_no_image_of_planks_in_one_direction() -> None:
+    rng, nobody, shift = np.random.default_rng(3), np.zeros((1, H, W), np.uint8), ImageShift()
+    planks = 128.0 + cv2.GaussianBlur(rng.normal(0.0, 150.0, (1, W)), (0, 0), 4.0)
+    floor = cv2.GaussianBlur(rng.normal(0.0, 60.0, (H, W)), (0, 0), 4.0) + planks
+    images = [(floor + rng.normal(0.0, 30.0, (H, W))).clip(0, 255).astype(np.uint8) for _ in range(41)]
+    shifts = [W * float(shift.look(np.repeat(image[None, ..., None], 3, axis=3), nobody)[0]) for image in images]
+    assert max(shifts) == 0.0
+
+
 def test_other_scene_has_no_shift() -> None:
     assert np.isnan(measured(view()[::-1, ::-1].copy(), mask()))
 
