@@ -66,14 +66,26 @@ def test_inspect_and_track_refuse_the_cameras_of_another_recording(tk: Tk, copy:
     tk("track", copy, "-o", tmp_path / "r.h5").complaint(first)
 
 
+def swap_first_two(folder: Path) -> None:
+    (one,), (other,) = (folder.glob(f"cam{c}*") for c in (1, 2))
+    between = one.with_name("between")
+    one.rename(between)
+    other.rename(one)
+    between.rename(other)
+
+
+def test_inspect_and_track_refuse_videos_that_show_another_cameras_empty_scene(
+    tk: Tk, copy: Path, tmp_path: Path
+) -> None:
+    swap_first_two(copy / "videos")
+    expected = "the video of cam1 shows the empty scene of cam2, the video of cam2 shows the empty scene of cam1"
+    for command in (["inspect", copy], ["track", copy, "-o", tmp_path / "r.h5"]):
+        tk(*command, "--masks", "none").complaint(str(copy), expected)
+
+
 def test_inspect_and_track_name_swapped_videos(tk: Tk, copy: Path, tmp_path: Path) -> None:
     for folder in ("videos", "masks"):
-        one, other = ((copy / folder).glob(f"cam{c}*") for c in (1, 2))
-        (one,), (other,) = one, other
-        between = one.with_name("between")
-        one.rename(between)
-        other.rename(one)
-        between.rename(other)
+        swap_first_two(copy / folder)
     ran = tk("inspect", copy, "--json")
     assert "the videos of cam1 and cam2 look swapped" in json.loads(ran.out)["findings"][0]
     tk("track", copy, "-o", tmp_path / "r.h5").complaint("the videos of cam1 and cam2 look swapped")

@@ -28,7 +28,7 @@ from tk.model.cameras.up import up_vector
 from tk.model.cameras.volume import Volume
 from tk.model.hull.coarse import Hull
 from tk.model.masks.image_health import MOST_SHIFT, ImageHealth, Sampled, contradiction, sampled
-from tk.model.masks.image_shift import ImageShift
+from tk.model.masks.image_shift import shift_between
 from tk.model.masks.mask_agreement import INCONSISTENT, Agreement, MaskAgreement
 from tk.model.masks.regions import clean_by_area
 from tk.model.masks.silhouettes import HOLE_SHARE
@@ -409,9 +409,8 @@ def _moved_since_empty(capture: Capture, images: NDArray[np.uint8], masks: Masks
     """Return a line for each camera whose image differs from that of its empty scene by a shift."""
     lines = []
     for camera, empty, image, mask in zip(capture.rig, capture.background() or (), images, masks, strict=False):
-        shift, (h, w) = ImageShift(), empty.shape[1:3]
-        shift.look(empty[:1], np.zeros((1, h, w), np.uint8))
-        moved = float(shift.look(image[None, :h, :w], mask[None, :h, :w])[0])
+        h, w = empty.shape[1:3]
+        moved = shift_between(empty[0], image[:h, :w], mask[:h, :w])
         if moved > MOST_SHIFT:
             lines.append(
                 f"camera {camera.name} was moved, by {moved * max(h, w):.0f} px, between its empty scene and the "

@@ -13,6 +13,7 @@ from tk.io.captures.frames import FrameSet
 from tk.io.captures.source import Source
 from tk.model.masks.background import median_plate
 from tk.model.masks.foreground import CollinearityForeground, Foreground
+from tk.model.masks.image_shift import exchanged_scenes
 from tk.model.masks.mog2 import Mog2Foreground
 from tk.run.learned_masks import MASK_SOURCES, LearnedMasks
 from tk.run.task import Task
@@ -125,8 +126,26 @@ def _labeller(task: Task, note: Callable[[str], None]) -> Labeller:
     else:
         clips = source.background()
         assert clips is not None
-        foreground = _learn(task, clips)
+        return _against_scene(task, clips)
     return lambda frame: Labels(*foreground.label(frame.images))
+
+
+def _against_scene(task: Task, clips: Sequence[NDArray[np.uint8]]) -> Labeller:
+    """Return a segmentation against clips of the empty scene, which refuses exchanged videos at the first frame."""
+    foreground, where = _learn(task, clips), task.source.where
+    names, scenes = task.setup.rig.names, [clip[0].copy() for clip in clips]
+
+    def label(frame: FrameSet) -> Labels:
+        labels = Labels(*foreground.label(frame.images))
+        if scenes:
+            exchanged = exchanged_scenes(scenes, frame.images, labels.masks)
+            scenes.clear()
+            if exchanged:
+                shown = (f"the video of {names[a]} shows the empty scene of {names[b]}" for a, b in exchanged.items())
+                raise CaptureError(f"{where}: {', '.join(shown)}: exchange the videos, or the files in background/")
+        return labels
+
+    return label
 
 
 def _learn(task: Task, clips: Sequence[NDArray[np.uint8]]) -> Foreground:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tk.model.masks.image_shift import ImageShift
+from tk.model.masks.image_shift import ImageShift, exchanged_scenes
 
 H, W = 240, 320
 SCENE = cv2.resize(
@@ -99,3 +99,16 @@ def test_each_camera_is_measured_in_its_turn_also_after_a_restart() -> None:
     again.restore(shift.state())
     moved += [(again.look(images, masks), W * again.look(images, masks))[1] for _ in range(2)]
     np.testing.assert_allclose(moved, [[0.0, 0.0, 0.0], [0.0, 8.0, 0.0], [0.0, 8.0, 0.0]], atol=0.2)
+
+
+def test_exchanged_videos_show_each_others_empty_scene() -> None:
+    rng = np.random.default_rng(4)
+    scenes = [cv2.resize(rng.integers(40, 200, (24, 32, 3), np.uint8), (W, H)) for _ in range(4)]
+    images = np.stack(scenes)
+    images[:, 60:200, 60:110] = 250
+    masks = np.broadcast_to(mask(), (4, H, W))
+    assert exchanged_scenes(scenes, images, masks) == {}
+    assert exchanged_scenes(scenes, images[[0, 2, 1, 3]], masks) == {1: 2, 2: 1}
+    assert exchanged_scenes(scenes, images[[1, 2, 0, 3]], masks) == {0: 1, 1: 2, 2: 0}
+    images[3] = 0
+    assert exchanged_scenes(scenes, images, masks) == {}

@@ -70,7 +70,7 @@ def part(masks: np.ndarray, cameras: list[int], rig: Rig = RIG) -> Agreement:
 
 def test_exact_masks_agree(masks: np.ndarray) -> None:
     found = compare(masks)
-    assert found.wrong == () and found.refusal == "" and found.swapped is None and found.closes.all()
+    assert found.wrong == () and found.refusal == "" and found.closes.all()
     assert found.disagreement < 0.01 and np.nanmax(excess(found.tangency)) < 0.5
     np.testing.assert_array_equal(found.shift_px, 0.0)
     assert 1.6 < found.extent_m < 2.1
@@ -129,8 +129,7 @@ def test_right_camera_with_a_single_partner_may_be_wrong_unnoticed(masks: np.nda
 
 def test_swapped_videos_are_named(masks: np.ndarray) -> None:
     found = compare(masks[:, [0, 3, 2, 1, 4]])
-    assert sorted(found.wrong) == [1, 3] and found.swapped == (1, 3)
-    assert found.reason(1) == "its video and that of c3 look swapped"
+    assert found.wrong == () and found.refusal.startswith("the videos of c1 and c3 look swapped")
 
 
 @pytest.mark.parametrize(("facing", "expected"), [(False, (0, 1)), (True, None)])

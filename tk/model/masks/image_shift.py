@@ -10,7 +10,8 @@ only if the images differ clearly more without it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import permutations
 from typing import Any
 
 import cv2
@@ -40,6 +41,9 @@ _LEAST_CORRELATION = 0.75
 # Least ratio of the images' difference without the shift to that with it. Shifts that noise of 25 grey levels causes on
 # dance give 1.02 to 1.12; a camera that is bumped or sags, from three quarters of a pixel on, gives 3.9 and more.
 _LEAST_RATIO = 1.25
+# Largest shift, share of the longer side, of an image that shows another camera's empty scene. Neighbouring cameras of
+# rig9 and hd see each other's scene with a shift of 0.23 and more; exchanged videos have 0.
+_SAME_PLACE = 0.1
 
 
 class ImageShift:
@@ -107,6 +111,37 @@ class ImageShift:
         self._begun = np.array(state["begun"], np.bool_)
         self._shift = np.array(state["shift"], np.float64)
         self._calls = int(state["calls"])
+
+
+def shift_between(first: NDArray[np.uint8], image: NDArray[np.uint8], mask: NDArray[np.uint8]) -> float:
+    """Return how far an image (h, w, 3) has moved from an image of the empty scene, as :meth:`ImageShift.look` does."""
+    shift = ImageShift()
+    shift.look(first[None], np.zeros((1, *first.shape[:2]), np.uint8))
+    return float(shift.look(image[None], mask[None])[0])
+
+
+def exchanged_scenes(
+    scenes: Sequence[NDArray[np.uint8]], images: NDArray[np.uint8], masks: NDArray[np.uint8]
+) -> dict[int, int]:
+    """Return the cameras whose image shows another camera's empty scene, and that camera.
+
+    Only cameras whose image does not show their own scene are compared with one another.
+
+    Args:
+        scenes: an image (h, w, 3) of the empty scene for each of C cameras.
+        images, masks: (C, H, W, 3), (C, H, W), of one frame, each at least as large as its scene.
+    """
+    seen = [
+        (image[: len(scene), : scene.shape[1]], mask[: len(scene), : scene.shape[1]])
+        for scene, image, mask in zip(scenes, images, masks, strict=True)
+    ]
+    other = [c for c, (image, mask) in enumerate(seen) if np.isnan(shift_between(scenes[c], image, mask))]
+    found = {}
+    for a, b in permutations(other, 2):
+        image, mask = seen[a]
+        if scenes[a].shape == scenes[b].shape and shift_between(scenes[b], image, mask) <= _SAME_PLACE:
+            found[a] = b
+    return found
 
 
 def _small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -64,7 +64,6 @@ class Agreement:
         names: of the cameras.
         tangency: the errors of all pairs.
         wrong: cameras that contradict the others; empty if the cameras are refused.
-        swapped: two cameras whose videos look swapped; None if none do.
         refusal: why the cameras cannot be used together, one line; empty if they can.
         outside: (C,) share of each camera's mask that lies outside the hull of the other right cameras; NaN if it
             shows nobody.
@@ -78,7 +77,6 @@ class Agreement:
     names: tuple[str, ...]
     tangency: Tangency
     wrong: tuple[int, ...]
-    swapped: tuple[int, int] | None
     refusal: str
     outside: Float
     shift_px: Float
@@ -112,9 +110,6 @@ class Agreement:
 
     def reason(self, camera: int) -> str:
         """Return what is wrong with a camera."""
-        if self.swapped and camera in self.swapped:
-            other = self.swapped[1 - self.swapped.index(camera)]
-            return f"its video and that of {self.names[other]} look swapped"
         error = self.tangency.error[camera, self.right]
         error, tolerance = error[np.isfinite(error)], TOLERANCE + 2 * self.tangency.pixel[camera]
         if self.outside[camera] < INCONSISTENT / 2 and not extends(self.tangency, camera):
@@ -173,9 +168,13 @@ class MaskAgreement:
             right.remove(odd)
         suspects = wrong if not refused else tested if C <= _SWAPS_OF else []
         swapped = self._swapped(frames, outlines, suspects)
-        if refused:
+        if swapped or refused:
             wrong, right = [], list(range(C))
-            refusal = self._contradiction(frames, pairs, tested or right, swapped)
+        if swapped:  # the other cameras may suffice, but the remedy is known
+            a, b = (self.rig.names[c] for c in swapped)
+            refusal = f"the videos of {a} and {b} look swapped: with them exchanged all cameras agree"
+        elif refused:
+            refusal = self._contradiction(frames, pairs, tested or right)
         else:
             refusal = self._one_sided(pairs, right, wrong)
         outside, shift = np.full(C, np.nan), np.full((C, 2), np.nan)
@@ -190,7 +189,6 @@ class MaskAgreement:
             names=self.rig.names,
             tangency=pairs,
             wrong=tuple(sorted(wrong)),
-            swapped=swapped,
             refusal=refusal,
             outside=outside,
             shift_px=shift,
@@ -220,13 +218,8 @@ class MaskAgreement:
                 found.append((float(np.nanmean(error)), (a, b)))
         return min(found)[1] if found else None
 
-    def _contradiction(
-        self, frames: Sequence[Masks], pairs: Tangency, cameras: Sequence[int], swapped: tuple[int, int] | None
-    ) -> str:
+    def _contradiction(self, frames: Sequence[Masks], pairs: Tangency, cameras: Sequence[int]) -> str:
         """Return why the cameras are refused if no majority of them is consistent."""
-        if swapped:
-            a, b = (self.rig.names[c] for c in swapped)
-            return f"the videos of {a} and {b} look swapped: with them exchanged all cameras agree"
         names = [self.rig.names[c] for c in cameras]
         listed = f"{', '.join(names[:-1])} and {names[-1]}"
         if len(frames) > 1 and all(np.array_equal(masks, frames[0]) for masks in frames[1:]):
