@@ -73,6 +73,13 @@ def swapped_videos(faulty: Faulty) -> None:
     between.rename(other)
 
 
+def swapped_cameras(faulty: Faulty) -> None:
+    """Swap the videos of two cameras, and their empty scenes."""
+    plate = {faulty.camera: faulty.plate(faulty.next), faulty.next: faulty.plate(faulty.camera)}
+    give_background(faulty, lambda c: plate.get(c, faulty.plate(c)))
+    swapped_videos(faulty)
+
+
 def exchanged_videos(faulty: Faulty) -> None:
     """Give each camera the video of the next one."""
     paths = [faulty.video(c) for c in faulty.all]
@@ -456,6 +463,7 @@ FAULTS: dict[str, Callable[[Faulty], None]] = {
     "blurred": lambda faulty: faulty.change(each(lambda p: np.asarray(cv2.GaussianBlur(p, (0, 0), 6.0), np.uint8))),
     "same video": same_video,
     "swapped videos": swapped_videos,
+    "swapped cameras": swapped_cameras,
     "camera excluded": camera_excluded,
     # all videos
     "cut": cut,
