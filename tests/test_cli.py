@@ -141,7 +141,7 @@ def test_bad_usage_is_one_line(tk: Tk, arguments: list[str], parts: list[str]) -
         (["--seed", "-1"], ["seed = -1"]),
         (["--cameras", "cam1,left"], ["no camera", "'left'", "cam1, cam2, cam3, cam4"]),
         (["--cameras", "cam1"], ["cameras cam1", "at least 2"]),
-        (["--cameras", ","], ["cameras", "at least 2"]),
+        (["--cameras", ","], ["--cameras ','", "give names"]),
         (["--masks", "nowhere"], ["masks nowhere"]),
         (["--method", "magic"], ["--method", "magic", "volumetric"]),
         (["--config", "none.toml"], ["none.toml"]),

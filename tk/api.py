@@ -38,13 +38,13 @@ class _Logged(Silent):
 
 
 def open_capture(
-    path: PathLike, cameras: Sequence[str] | None = None, masks: str = "auto", resample: bool = False
+    path: PathLike, cameras: str | Sequence[str] | None = None, masks: str = "auto", resample: bool = False
 ) -> Capture:
     """Open a capture folder.
 
     Args:
         path: the folder with `calibration.toml` and `videos/`.
-        cameras: names of the cameras to use; all if None.
+        cameras: names of the cameras to use, as a list or with commas between them; all if None.
         masks: "auto" (those of the capture, if there are any), "none" (segment the videos), "median" (segment against
             the recording's median), or a folder of masks.
         resample: choose each frame's images by their time stamps, for cameras of different or variable rates.
@@ -52,6 +52,8 @@ def open_capture(
     Raises:
         tk.errors.CaptureError: what is wrong with the folder, in one line that names the file.
     """
+    if isinstance(cameras, str):
+        cameras = [name.strip() for name in cameras.split(",")]
     return open_recording(Path(path), tuple(cameras) if cameras else None, masks, resample)
 
 
@@ -123,6 +125,10 @@ def track(
             before it is in the file.
         KeyboardInterrupt: the user stopped the run; with ``output`` the finished frames are in the file.
     """
+    if not (len(frames) == 2 and isinstance(frames[0], int) and isinstance(frames[1], int | None)):
+        raise ConfigError(f"frames {frames!r}: give the first one and the end, or None, for example (0, 100)")
+    if segmenter is not None and not hasattr(segmenter, "segment"):
+        raise ConfigError(f"segmenter {segmenter!r}: has no method segment, see tk.segmenters.Segmenter")
     settings = config or Settings()
     if seed is not None:
         settings = replace(settings, seed=seed)

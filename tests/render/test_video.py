@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from tests.conftest import Tk
-from tk.errors import ExportError
+from tk.errors import DiskFullError, ExportError
 from tk.io.paths import replacing
 from tk.io.results.reader import read_result
 from tk.model.body.joints import SEGMENTS
 from tk.render.palette import SEGMENT_COLORS
 from tk.render.scene import HEIGHT, WIDTH, Scene
-from tk.render.video import made_here, video_writer
+from tk.render.video import _Encoder, made_here, video_writer
 
 
 def moving(count: int) -> list[np.ndarray]:
@@ -61,6 +61,19 @@ def test_error_keeps_the_earlier_video(tmp_path: Path) -> None:
             add(np.zeros((63, 95, 3), np.uint8))
     assert path.read_bytes() == b"precious" and list(tmp_path.iterdir()) == [path]
     assert not made_here(path)
+
+
+@pytest.mark.parametrize("when", ["at once", "at the end"])
+def test_full_disk_ends_the_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
+    def fail(encoder: _Encoder) -> None:
+        while when == "at the end" and encoder._next() is not None:
+            pass
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(_Encoder, "_encode", fail)
+    with pytest.raises(DiskFullError, match="No space left"), video_writer(tmp_path / "video.mp4", 15) as add:
+        for picture in moving(20):
+            add(picture)
 
 
 def test_file_is_renamed_when_complete(tmp_path: Path) -> None:

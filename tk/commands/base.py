@@ -99,8 +99,8 @@ class Commands(click.Group):
 
 
 def working(stage: str) -> ConsoleReporter:
-    """Return a reporter that shows on a terminal that work without countable frames goes on."""
-    return ConsoleReporter(quiet=not sys.stderr.isatty(), stage=stage)
+    """Return a reporter that shows that work without countable frames goes on."""
+    return ConsoleReporter(stage=stage, patient=True)
 
 
 def print_json(**values: object) -> None:
@@ -126,8 +126,12 @@ Span = tuple[int, int | None]
 
 
 def _split(ctx: click.Context, option: click.Parameter, names: str | None) -> Names:
-    """Return the names in ``A,B,…``; None without any text."""
-    return tuple(name.strip() for name in names.split(",") if name.strip()) if names else None
+    """Return the names in ``A,B,…``; None if the option is not given."""
+    if names is None:
+        return None
+    if not (given := tuple(name.strip() for name in names.split(",") if name.strip())):
+        raise ConfigError(f"{option.opts[0]} {names!r}: give names, with commas between them")
+    return given
 
 
 def _span(ctx: click.Context, option: click.Parameter, frames: str | None) -> Span:

@@ -93,6 +93,7 @@ class ConsoleReporter(_Notes):
         later: duration of the stages after the last frame, as a multiple of the duration of all frames.
         last: the part of ``later`` of the stages whose progress is not reported.
         stage: the first stage.
+        patient: without a terminal, print the first stage only after two seconds.
     """
 
     def __init__(
@@ -102,6 +103,7 @@ class ConsoleReporter(_Notes):
         later: float = 0.0,
         last: float = 0.0,
         stage: str = "",
+        patient: bool = False,
     ) -> None:
         super().__init__(quiet, console)
         self._handler = logging.Handler(logging.INFO)
@@ -110,14 +112,14 @@ class ConsoleReporter(_Notes):
         self._begun = self._started = self._last = time.perf_counter()
         self._later, self._last_stages, self._last_s = later, last, 0.0
         self._end = float("-inf")
-        self._stage, self._stage_begun = stage, self._begun
+        self._stage, self._stage_begun, self._patient = stage, self._begun, patient
         self._closed = threading.Event()
 
     def __enter__(self) -> ConsoleReporter:
         self._level_before = _LOG.level
         _LOG.addHandler(self._handler)
         _LOG.setLevel(logging.INFO)
-        if self._stage:
+        if self._stage and (self._bars or not self._patient):
             self.stage(self._stage)
         if not self._quiet and not self._bars:
             threading.Thread(target=self._show_life, daemon=True).start()

@@ -56,6 +56,7 @@ class _Encoder:
         self._fps = Fraction(fps).limit_denominator(1001)
         self._waiting: queue.Queue[Image | None] = queue.Queue(_WAITING)
         self._failure: Exception | None = None
+        self._ended = False
         self._thread = threading.Thread(target=self._run, name="tk-encode", daemon=True)
         self._thread.start()
 
@@ -78,11 +79,17 @@ class _Encoder:
             self._encode()
         except Exception as error:  # raised when the next image is added
             self._failure = error
-            while self._waiting.get() is not None:  # empty the queue, so that ``add`` never blocks
+            while self._next() is not None:  # empty the queue, so that ``add`` never blocks
                 pass
 
+    def _next(self) -> Image | None:
+        """Return the next image; None, also when asked again, after the last one."""
+        picture = None if self._ended else self._waiting.get()
+        self._ended = picture is None
+        return picture
+
     def _encode(self) -> None:
-        picture = self._waiting.get()
+        picture = self._next()
         if picture is None:
             return
         import av  # slow to import, and only needed here
@@ -94,7 +101,7 @@ class _Encoder:
             stream.pix_fmt = "yuv420p"
             while picture is not None:
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="yuv420p")))
-                picture = self._waiting.get()
+                picture = self._next()
             container.mux(stream.encode(None))
 
 

@@ -113,7 +113,8 @@ def _labeller(task: Task, note: Callable[[str], None]) -> Labeller:
         return _given_masks
     if origin.startswith(_SEGMENTER):
         name = origin.removeprefix(_SEGMENTER)
-        note(f"{source.where}: no masks and no background/; the segmenter {name} makes the masks")
+        if source.segmenter is None:
+            note(f"{source.where}: no masks and no background/; the segmenter {name} makes the masks")
         from tk.segmenters.people_masks import PeopleMasks  # SciPy, which takes a second to import
 
         made = PeopleMasks(source.segmenter or load(name), name, setup.rig, setup.volume)

@@ -169,6 +169,17 @@ def test_damaged_state_is_refused(path: Path, change: Callable[[np.ndarray], Any
     assert path.read_bytes() == before
 
 
+@pytest.mark.parametrize(("dataset", "value", "message"), [("pose", np.nan, "NaN"), ("frames", -5, "out of range")])
+def test_damaged_frames_are_refused_before_the_run_goes_on(
+    path: Path, dataset: str, value: float, message: str
+) -> None:
+    write(path, 6)
+    with h5py.File(path, "r+") as file:
+        file[dataset][2] = value
+    with pytest.raises(ResultError, match=f"/{dataset}.*{message}"):
+        resume(path, 9)
+
+
 def test_state_is_intact_after_the_result_was_copied_and_revised(path: Path) -> None:
     state = {**make_state(3), "unknown": np.array([np.nan, -np.nan]), "none": "", "umlaut": "ä", "flag": True}
     with ResultWriter.create(path, META) as writer:

@@ -205,8 +205,9 @@ class Result:
             f"{int((self.status == s).sum())} {s.name.lower()}" for s in Status if (self.status == s).any()
         )
         first = f"{self.frames[0]} to {self.frames[-1]}, " if len(self) else ""
-        known = np.empty(0) if self.sigma is None else self.sigma[self.has_pose & np.isfinite(self.sigma).any(axis=1)]
-        sigma = f"median sigma of a joint {100 * np.nanmedian(known):.1f} cm" if known.size else "no sigma"
+        known = np.empty(0) if (expected := self.expected_error) is None else expected[self.has_pose]
+        sure = np.isfinite(known).any()
+        sigma = f"expected error of a joint {100 * np.nanmedian(known):.1f} cm" if sure else "no sigma"
         return (
             f"Result {self.path.name}: capture {self.meta.capture}, method {self.meta.method}\n"
             f"{len(self)} frames, {first}{self.meta.fps:g} frames/s, {self.joints.shape[1]} joints\n"

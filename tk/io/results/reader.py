@@ -30,6 +30,7 @@ from tk.io.results.schema import (
     prefix_of,
     smoothed_columns,
 )
+from tk.io.results.status import has_pose
 from tk.model.body.joints import in_joint_order
 from tk.model.cameras.camera import Camera, Rig
 
@@ -174,8 +175,8 @@ class StoredPerson:
         """Return the fitted body; {} if there is none."""
         return self._file.values(f"{self._prefix}model", MAX_NUMBER)
 
-    def result(self, shared: dict[str, Any]) -> Result:
-        """Return the whole content; ``shared`` are the fields of Result that belong to the file."""
+    def rows(self) -> dict[str, Any]:
+        """Return the values of all frames, by the field of Result, after a check of each dataset."""
         found: dict[str, Any] = {"timing": {}, "angles": {}}
         for path, column in self._columns.items():
             values = self._read(path, column.entry, *column.shape)
@@ -184,7 +185,14 @@ class StoredPerson:
             else:
                 found[column.entry.field] = values
         _check_frames(self._file, self._prefix, found["frames"])
-        smoothed = None
+        nan = ~np.isfinite(found["pose"]).all(axis=1) & has_pose(found["status"])
+        if nan.any():
+            self._file.fail(f"/{self._prefix}pose: frame {found['frames'][nan][0]} is NaN; the file is damaged")
+        return found
+
+    def result(self, shared: dict[str, Any]) -> Result:
+        """Return the whole content; ``shared`` are the fields of Result that belong to the file."""
+        found, smoothed = self.rows(), None
         if f"{self._prefix}smoothed" in self._file:
             smoothed = {
                 path: self._read(f"smoothed/{path}", column.entry, *column.shape)

@@ -99,6 +99,7 @@ class ResultWriter:
                     file.fail(f"{reason}; {remedy}")
                 if difference:
                     file.fail(f"was made differently: {difference}; {remedy}")
+                person.rows()  # the second pass needs them
             written = [person.count for person in people]
             frames, rows, state = read_state(file) or (written[0], written, {})
             if len(rows) > len(written) or any(a > b for a, b in zip(rows, written, strict=False)):
