@@ -18,6 +18,7 @@ from tk.io.paths import c_name
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv")
 
 _FULL_RANGE = 2  # FFmpeg's AVCOL_RANGE_JPEG
+_REORDERED = 16  # most images that precede another one in the file but follow it in the video, H.264
 
 
 @dataclass(frozen=True)
@@ -62,21 +63,26 @@ def probe_video(path: Path, is_mask: bool = False) -> VideoClip:
 
 
 def damaged_images(path: Path, stop: int) -> list[int]:
-    """Return the images of a video before ``stop`` that FFmpeg decodes in part only. It fills them up without an error,
-    so no reader notices."""
+    """Return the images of a video before ``stop`` that FFmpeg cannot decode unless it repairs them, which it does
+    without an error, so that no reader notices."""
     import av  # slow to import, and only needed for a message
     import av.error
 
-    found = []
+    times: list[int] = []
+    damaged: set[int] = set()
     with av.open(c_name(path, VideoError)) as container:
-        container.streams.video[0].thread_type = "AUTO"
-        try:
-            for i, image in enumerate(islice(container.decode(video=0), stop)):
-                if image.is_corrupt:
-                    found.append(i)
-        except av.error.FFmpegError:
-            pass  # a reader fails here, too
-    return found
+        stream = container.streams.video[0]
+        stream.thread_type = "SLICE"  # threads of whole images report errors with later ones
+        stream.codec_context.options = {"err_detect": "explode"}
+        for packet in islice(container.demux(stream), stop + _REORDERED):
+            if packet.pts is None:  # the last one has no image
+                continue
+            times.append(packet.pts)
+            try:
+                packet.decode()
+            except av.error.FFmpegError:
+                damaged.add(packet.pts)
+    return [i for i, time in enumerate(sorted(times)[:stop]) if time in damaged]
 
 
 class _VideoReader:
