@@ -78,8 +78,7 @@ class LimbSearch:
         """Return at most two poses (B, D) with a limb elsewhere: rays screen all its candidates in one launch, and the
         limb alone settles from the best ones."""
         body, evidence, pose = self._body, self._evidence, self._pose
-        others = np.setdiff1d(np.arange(len(body.parts), dtype=np.int32), limb.parts)
-        without, rest = evidence.cast(body, pose[None], others)
+        without, rest = evidence.cast(body, pose[None], limb.rest)
         if not misplaced and without[0] - self.own > self._surplus:
             return np.empty((0, len(pose)))  # the limb covers more than the surplus area that it could cover elsewhere
         before = Cast(rest.label[0].copy(), rest.depth[0].copy())

@@ -69,19 +69,24 @@ class PixelOwners:
 
         ``unknown``: pixels of somebody unknown may show this person.
         """
-        masks = frame.masks.copy()
-        own = self.owner == person
-        if unknown:
-            own |= self.owner == NOBODY
-        np.putmask(masks, (masks >= PERSON) & ~own, OTHERS)
-        return replace(frame, masks=masks)
+        return replace(frame, masks=self._masks(frame, (person, NOBODY) if unknown else (person,)))
 
     def unknown(self, frame: Observation) -> Observation:
         """Return the observation of people who are unknown; pixels of known people are
         :data:`~tk.kernels.mask_values.OTHERS`."""
+        return replace(frame, masks=self._masks(frame, (NOBODY,)))
+
+    def _masks(self, frame: Observation, kept: Sequence[int]) -> NDArray[np.uint8]:
+        """Return a frame's masks; pixels of other owners than ``kept`` are OTHERS."""
         masks = frame.masks.copy()
-        np.putmask(masks, (masks >= PERSON) & (self.owner != NOBODY), OTHERS)
-        return replace(frame, masks=masks)
+        for mask, owner in zip(masks, self.owner, strict=True):
+            x, y, w, h = cv2.boundingRect(mask)  # most of an image is background
+            box = slice(y, y + h), slice(x, x + w)
+            taken = mask[box] >= PERSON
+            for number in kept:
+                taken &= owner[box] != number
+            np.copyto(mask[box], OTHERS, where=taken)
+        return masks
 
     def areas(self, masks: NDArray[np.uint8]) -> NDArray[np.int64]:
         """Return (K + 1, V) the number of cells of each person in masks (V, H, W), last those of unknown people."""
@@ -132,6 +137,7 @@ def assign(
     owner = np.full(frame.masks.shape, NOBODY, np.int8)
     areas = [np.count_nonzero(body.label, axis=(1, 2)) for body in bodies if body is not None]
     least = unknown * float(np.median(areas)) if areas else 0.0
+    colored = frame.images.size > 0 and any(body is not None and body.log_likelihood is not None for body in bodies)
     for v, camera in enumerate(rig):
         cells = _around(shown[v])
         cell = grid.step / float(camera.matrix[0, 0])
@@ -145,7 +151,7 @@ def assign(
         stranger = _stranger(shown[v][cells], shapes, cell, least)
         view = _View(grid.step, shown[v][cells], [*shapes, *stranger])
         pixels = _pixels(cells, grid.step)
-        image = frame.images[v][pixels] if frame.images.size else None
+        image = frame.images[v][pixels] if colored else None
         owner[v][pixels] = view.owners(frame.masks[v][pixels] >= PERSON, image)
     return PixelOwners(grid, owner, len(bodies))
 
@@ -265,8 +271,8 @@ def _log_color(shape: _Shape, label: NDArray[np.uint8], bins: NDArray[np.int32])
     body = shape.body
     if body is None or body.log_likelihood is None or body.group is None:
         return np.full(bins.shape, -np.log(COLOR_BINS), np.float32)
-    log_likelihood = body.log_likelihood
-    return np.maximum(log_likelihood[body.group[label.astype(np.int64) - 1], bins], log_likelihood[-1, bins])
+    likeliest = np.maximum(body.log_likelihood, body.log_likelihood[-1])
+    return likeliest.ravel().take(body.group[label.astype(np.int64) - 1] * COLOR_BINS + bins)
 
 
 def enlarged(cells: NDArray, step: int, shape: tuple[int, ...], interpolation: int = cv2.INTER_NEAREST) -> NDArray:

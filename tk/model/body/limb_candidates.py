@@ -47,7 +47,8 @@ class Limb:
     name: str  # of `LIMBS`
     skeleton: Skeleton
     dofs: NDArray[np.int64]  # (L,) its degrees of freedom
-    parts: NDArray[np.int32]  # (K,) int32 its parts
+    parts: NDArray[np.int32]  # (K,) its parts
+    rest: NDArray[np.int32]  # (P - K,) all other parts of the body
     arrays: ConeArrays  # the body for the kernels, with the contours of these parts only
     joints: list[int]  # elbow and wrist, or knee and ankle, as indices into the skeleton's joints
     grid: Float  # (N, L) candidates
@@ -96,6 +97,7 @@ def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
                 skeleton=skeleton,
                 dofs=dofs,
                 parts=np.flatnonzero(parts).astype(np.int32),
+                rest=np.flatnonzero(~parts).astype(np.int32),
                 arrays=arrays._replace(curves=arrays.curves[parts[arrays.curves[:, 0]]]),
                 joints=[JOINTS.index(joint) for joint in LIMBS[name][1:]],
                 grid=np.clip(grid, skeleton.lower[dofs], skeleton.upper[dofs]),

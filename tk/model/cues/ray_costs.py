@@ -9,6 +9,7 @@ Costs are shares of the person's rays, averaged over the views: without colours 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,8 +138,13 @@ class Evidence:
 
     def shares(self, total: Float) -> Float:
         """Return sums of costs (B, V) as shares of the person's rays; NaN where a view sees nobody."""
-        seen = _areas(self.person, self.others)
+        seen = self._seen
         return np.where(seen > 0, total / np.maximum(seen, 1), np.nan)
+
+    @cached_property
+    def _seen(self) -> NDArray[np.float64]:
+        """(V,) the person's area in each view, rays."""
+        return _areas(self.person, self.others)
 
     def residual(self, label: NDArray[np.uint8]) -> Float:
         """Return (V, 2) missing and surplus area of a rendered body, labels (V, h, w), see :func:`residual_of`."""

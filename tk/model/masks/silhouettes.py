@@ -75,7 +75,7 @@ class Views:
                 if (part := mask[crop]).size:
                     out[crop] = kept = clean(part)
                     if shared:  # a region that others cut off may be small: it is no evidence, not background
-                        out[crop][(part == OTHERS) | ((part >= PERSON) & (kept == 0))] = OTHERS
+                        np.copyto(out[crop], OTHERS, where=(part == OTHERS) | ((part >= PERSON) & (kept == 0)))
             masks = cleaned
         V, H, W = masks.shape
         levels = [masks, *(np.zeros((V, -(-H // 2**k), -(-W // 2**k)), np.uint8) for k in range(1, scales))]
@@ -106,7 +106,7 @@ def _halve(levels: Sequence[Masks], crop: tuple[slice, slice], shared: bool) -> 
         others = _halved(np.uint8(255) * (part == OTHERS)) > 0 if shared else None
         part = _halved(part)
         if others is not None:
-            part[others] = OTHERS
+            np.copyto(part, OTHERS, where=others)
         place = level[top : top + part.shape[0], left : left + part.shape[1]]
         place[...] = part[: place.shape[0], : place.shape[1]]
 
