@@ -193,7 +193,7 @@ def _free_port() -> int:
 def _report_workers(client: Any, reporter: BatchReporter, captures: int) -> None:
     found = client.scheduler_info(n_workers=-1)["workers"].values()
     threads = sum(worker["nthreads"] for worker in found)
-    reporter.note(f"{captures} captures to track on {len(found)} workers")
+    reporter.note(f"captures to track: {captures}; workers: {len(found)}")
     if not found:
         reporter.note("the scheduler has no workers yet; waiting for them")
     elif threads > len(found):

@@ -139,7 +139,7 @@ def end(output: Path, summary: Summary, quiet: bool, as_json: bool) -> None:
         counts = [f"{summary.lost} lost", *(f"{count} {what}" for what, count in rare.items() if count)]
         several = f" of {summary.people} people" if summary.people > 1 else ""
         parts = [f"{summary.frames} frames{several} in {output}", *counts, *_expected_error(output)]
-        click.echo(", ".join([*parts, f"{rate:.1f} frames/s"]), err=True)
+        click.echo(", ".join([*parts, f"tracked in {summary.seconds:.1f} s"]), err=True)
     if summary.interrupted:
         next_step = "continue with the same command and --resume" if summary.frames else "no frame was finished"
         base.exit_with(1, f"interrupted; {next_step}")

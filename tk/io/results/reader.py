@@ -30,7 +30,6 @@ from tk.io.results.schema import (
     prefix_of,
     smoothed_columns,
 )
-from tk.io.results.status import has_pose
 from tk.model.body.joints import in_joint_order
 from tk.model.cameras.camera import Camera, Rig
 
@@ -185,9 +184,6 @@ class StoredPerson:
             else:
                 found[column.entry.field] = values
         _check_frames(self._file, self._prefix, found["frames"])
-        nan = ~np.isfinite(found["pose"]).all(axis=1) & has_pose(found["status"])
-        if nan.any():
-            self._file.fail(f"/{self._prefix}pose: frame {found['frames'][nan][0]} is NaN; the file is damaged")
         return found
 
     def result(self, shared: dict[str, Any]) -> Result:

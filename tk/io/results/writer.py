@@ -18,6 +18,7 @@ from tk.io.results.files import ANY_HDF5, RESULT
 from tk.io.results.layout import Layout, Values, pack_state
 from tk.io.results.reader import open_result, read_state
 from tk.io.results.schema import checked_row
+from tk.io.results.status import has_pose
 
 Model = Mapping[str, Value]
 
@@ -99,7 +100,9 @@ class ResultWriter:
                     file.fail(f"{reason}; {remedy}")
                 if difference:
                     file.fail(f"was made differently: {difference}; {remedy}")
-                person.rows()  # the second pass needs them
+                stored = person.rows()  # the second pass needs them
+                if not np.isfinite(stored["pose"][has_pose(stored["status"])]).all():
+                    file.fail(f"/pose is NaN in a frame that has a pose; {remedy}")
             written = [person.count for person in people]
             frames, rows, state = read_state(file) or (written[0], written, {})
             if len(rows) > len(written) or any(a > b for a, b in zip(rows, written, strict=False)):
