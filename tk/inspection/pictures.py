@@ -30,7 +30,7 @@ _SIZE = 0.45  # of the letters
 _MASK, _HULL, _UP = of_hue(120.0), of_hue(300.0), of_hue(45.0)
 _LEGEND = (
     ("mask", _MASK),
-    ("hull of the others", _HULL),
+    ("hull of the others (coarse)", _HULL),
     ("mask outside the hull", LOST),
     ("volume", VOLUME),
     ("up", _UP),
