@@ -46,4 +46,5 @@ def batch(
             raise KeyboardInterrupt("the same command continues") from None
     if not quiet:
         click.echo(f"the summary is in {output / 'summary.html'}", err=True)
-    base.exit_with(exit_code(outcomes))
+    failed = sum(outcome.failed for outcome in outcomes.values())
+    base.exit_with(exit_code(outcomes), f"{failed} of {len(outcomes)} captures failed" if failed else "")

@@ -145,8 +145,15 @@ def _pixel_error(view: Rig, estimate: Float, truth: Float, joints: Sequence[str]
     a, b = (camera.project(p[:, chosen].reshape(-1, 3))[0] for p in (estimate, truth))
     ankles = truth[:, [JOINTS.index(name) for name in ANKLE_JOINTS]].mean(axis=1)
     crown, foot = (camera.project(p)[0] for p in (truth[:, JOINTS.index("head_top")], ankles))
-    distance = float(np.nanmean(np.linalg.norm(a - b, axis=1)))
-    return distance, distance / float(np.nanmean(np.linalg.norm(crown - foot, axis=1)))
+    distance, height = _mean_length(a - b), _mean_length(crown - foot)
+    return distance, distance / height
+
+
+def _mean_length(vectors: Float) -> float:
+    """Return the mean length of those vectors (N, 2) that are known; NaN if none is."""
+    length = np.linalg.norm(vectors, axis=1)
+    known = length[np.isfinite(length)]
+    return float(known.mean()) if known.size else float("nan")
 
 
 def _silhouette_errors(result: Result, capture: Capture) -> tuple[list[float] | None, str]:
