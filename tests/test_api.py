@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,6 +42,19 @@ def test_every_public_name_exists():
 def test_resume_without_an_output_is_refused(tiny: Path) -> None:
     with pytest.raises(ConfigError, match="resume and force need an output file"):
         tk.track(tiny, resume=True)
+
+
+@pytest.mark.parametrize("frames", ["a", 5, (0, "x"), (0.5, None), (1, 2, 3)])
+def test_frames_that_are_none_are_refused(tiny: Path, frames: Any) -> None:
+    with pytest.raises(ConfigError, match=r"^frames .*give the first one and the end"):
+        tk.track(tiny, frames=frames)
+
+
+def test_arguments_of_other_types_are_accepted_or_refused_in_one_line(tiny: Path) -> None:
+    assert tk.open_capture(tiny, "cam1, cam3").rig.names == ("cam1", "cam3")
+    tk.track(tiny, frames=(np.int64(0), np.int64(3)))  # begins when the first estimate is asked for
+    with pytest.raises(ConfigError, match="has no method segment"):
+        tk.track(tiny, segmenter=lambda image: image)  # type: ignore[arg-type]
 
 
 def test_errors_name_no_options_of_the_command_line() -> None:

@@ -6,6 +6,7 @@ import logging
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from operator import index
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict, overload
 
@@ -125,8 +126,11 @@ def track(
             before it is in the file.
         KeyboardInterrupt: the user stopped the run; with ``output`` the finished frames are in the file.
     """
-    if not (len(frames) == 2 and isinstance(frames[0], int) and isinstance(frames[1], int | None)):
-        raise ConfigError(f"frames {frames!r}: give the first one and the end, or None, for example (0, 100)")
+    try:
+        first, end = frames
+        frames = index(first), None if end is None else index(end)
+    except (TypeError, ValueError):
+        raise ConfigError(f"frames {frames!r}: give the first one and the end, or None: (0, 100)") from None
     if segmenter is not None and not hasattr(segmenter, "segment"):
         raise ConfigError(f"segmenter {segmenter!r}: has no method segment, see tk.segmenters.Segmenter")
     settings = config or Settings()

@@ -13,7 +13,7 @@ import pytest
 from tests.conftest import Tk
 from tests.export.conftest import FIRST, FPS, FRAMES, LOST, SKELETON, Write, poses, status
 from tests.export.test_opensim import read_trc
-from tk.errors import ExportError, ResultError
+from tk.errors import ConfigError, ExportError, ResultError
 from tk.export import FORMATS, Motion, export, read_motion
 from tk.io.results.status import Status
 from tk.model.body.angles import standing_rotations
@@ -168,6 +168,17 @@ def test_unusable_requests_are_refused(write: Write, tmp_path: Path) -> None:
         del file["model/dimensions/thigh"]
     with pytest.raises(ResultError, match="/model/dimensions/thigh"):
         export(path, ["csv"])
+
+
+@pytest.mark.parametrize("kind", ["csv", "ply"])
+def test_nothing_is_written_into_a_captures_own_folders(write: Write, tmp_path: Path, kind: str) -> None:
+    path, capture = write(), tmp_path / "capture"
+    (capture / "videos").mkdir(parents=True)
+    (capture / "calibration.toml").write_text("")
+    with pytest.raises(ConfigError, match=r"lies in .*videos, whose files tk reads"):
+        export(path, [kind], capture / "videos", force=True)
+    assert not list((capture / "videos").iterdir())
+    assert export(path, [kind], capture).files
 
 
 def test_frames_without_numbers_are_not_known(write: Write) -> None:

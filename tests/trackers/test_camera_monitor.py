@@ -174,6 +174,22 @@ def test_absent_person_is_lost_and_recovered_on_return(scene: Scene, cameras: li
     assert "fewer than two cameras see anybody: no pose, frames 5 to 7" in monitor.report()
 
 
+def test_person_who_is_elsewhere_without_having_been_lost_is_reported(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step = RegionTracker.step
+
+    def jump(tracker: RegionTracker, frame: Observation) -> Estimate:
+        estimate = step(tracker, frame)
+        return replace(estimate, status="recovered") if frame.index == 7 else estimate
+
+    monkeypatch.setattr(RegionTracker, "step", jump)
+    expected = "elsewhere than in the frame before, as after a cut in the recording: searched for again, frame 7"
+    assert [expected in line for line in scene.follow(lambda frame: frame)[0].report()] == [True]
+    after_a_loss = scene.follow(blind([0, 1, 2, 3], range(5, 7)))[0].report()
+    assert after_a_loss and not any("as after a cut" in line for line in after_a_loss)
+
+
 @pytest.mark.parametrize("part", [(0.0, 0.5), (0.5, 1.0)], ids=["the head's half", "the feet's half"])
 def test_camera_with_torn_mask_is_excluded_until_its_masks_are_whole(scene: Scene, part: tuple[float, float]) -> None:
     monitor, estimates, used = scene.follow(torn(1, range(2, 5), part))

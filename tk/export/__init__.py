@@ -20,7 +20,7 @@ from tk.export.mot import write_mot
 from tk.export.motion import Motion, motion_of, read_motion
 from tk.export.ply import write_body_meshes
 from tk.export.trc import write_trc
-from tk.io.paths import Kind, check_not_input, check_output, looks_like, replacing
+from tk.io.paths import Kind, check_not_input, check_output, looks_like, replacing, resolved
 from tk.io.results.data import Result
 from tk.io.results.reader import read_result
 
@@ -99,8 +99,9 @@ def export(
         if name not in failed
         for ending, write in form.outputs
     ]
+    capture = next((each for each in resolved(folder).parents if (each / "calibration.toml").is_file()), None)
     for _, name, target, _ in jobs:
-        _check_target(target, FORMATS[name], path, force)
+        _check_target(target, FORMATS[name], path, force, capture)
     motions, notes = _motions(people, smoothed, ", ".join(name for name, form in chosen.items() if form.holds))
     written, refused = list[Path](), list[TkError]()
     for person, name, target, write in jobs:
@@ -128,12 +129,13 @@ def _chosen(formats: Sequence[str], bvh_units: str) -> dict[str, Format]:
     return {name: bvh if name == "bvh" else FORMATS[name] for name in names}
 
 
-def _check_target(target: Path, form: Format, result: Path, force: bool) -> None:
-    """Refuse a target that exists, unless it is of the format and ``force``; and the result itself."""
+def _check_target(target: Path, form: Format, result: Path, force: bool, capture: Path | None) -> None:
+    """Refuse a target that exists, unless it is of the format and ``force``; the result itself; and a capture's own
+    folders, if the target lies in a ``capture``."""
     if form.begins is not None and target.parent.is_dir():
         kind = Kind(f"a file of tk export in {target.suffix}", (target.suffix,), looks_like(form.begins))
-        check_output(target, kind, force, [result])
-    elif check_not_input(target, [result]).exists() and not force:
+        check_output(target, kind, force, [result], capture)
+    elif check_not_input(target, [result], capture).exists() and not force:
         raise ExportError(f"{target}: exists; choose another folder", hint="or replace it with --force")
 
 

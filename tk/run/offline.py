@@ -305,12 +305,7 @@ class _Finisher:
             self._track_again(tracker, masks, draft)
         return tracker, masks
 
-    def _track_again(
-        self,
-        tracker: TwoPassTracker,
-        masks: MaskStore,
-        draft: _Draft,
-    ) -> None:
+    def _track_again(self, tracker: TwoPassTracker, masks: MaskStore, draft: _Draft) -> None:
         """Track the frames again of which every synchronised camera has an image, beginning at the first pass's pose;
         none if the source cannot be read again. ``masks``: synchronised; they are not made again."""
         result, source = draft.result, self.task.source.shifted(self.cameras.time_offset_s.tolist())

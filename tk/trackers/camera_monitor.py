@@ -35,11 +35,12 @@ Float = NDArray[np.float64]
 
 # Frames of the opening that are compared.
 _OPENING = 5
-_STATE = ("excluded", "refused")
+_STATE = ("excluded", "refused", "was_lost")
 # Reasons, as in messages.
 _DISAGREES, _TOO_FEW = "disagrees with the others", "fewer than two cameras see anybody"
 _MISSING = "misses a part of the person"
 _IMPLAUSIBLE = "the pose found cannot be true"
+_JUMPED = "the person is elsewhere than in the frame before, as after a cut in the recording"
 
 Span = tuple[int, int, int]
 """Frames: the first, the last, and their number."""
@@ -75,9 +76,10 @@ class CameraMonitor:
         self._tested = False
         self._judge = ResidualJudge(tracker, setup.rig) if isinstance(tracker, RegionTracker) else None
         self._spans: dict[str, Span] = {}  # of exclusion, by "camera/reason"
-        self._lost: dict[str, Span] = {}  # by reason
+        self._lost: dict[str, Span] = {}  # losses and jumps, by reason
         self._opening_reasons: dict[int, str] = {}
         self._refused = np.zeros((), np.int64)  # poses refused since the last accepted one, because of their residual
+        self._was_lost = np.zeros((), bool)  # whether the last frame has no pose
         self._excess = 0.0  # of this frame, mean over the cameras used; 0 if it was not tested
 
     def start(self, frames: Sequence[Observation]) -> list[Observation]:
@@ -142,7 +144,10 @@ class CameraMonitor:
             torn = self._judge is not None and self._judge.torn[camera]
             reason = _MISSING if torn else _DISAGREES
             _count(self._spans, f"{camera}/{reason}", frame.index)
+        if estimate.status == "recovered" and not self._was_lost:
+            _count(self._lost, _JUMPED, frame.index)
         estimate = self._plausible(frame.index, estimate, used)
+        self._was_lost = np.array(estimate.status == "lost")
         if self._judge is not None and estimate.status != "lost" and self._judge.contradicts(estimate):
             estimate = replace(estimate, status="suspect")
         return estimate, used
@@ -188,7 +193,7 @@ class CameraMonitor:
     @property
     def doubted(self) -> NDArray[np.bool_]:
         """(C,) the cameras whose images may be the cause of a line of :meth:`report`: those that were left out, which
-        the others contradicted; all of them if the person was lost."""
+        the others contradicted; all of them if the person was lost, or jumped."""
         left_out = {int(key.partition("/")[0]) for key in self._spans}
         return np.array([bool(self._lost) or camera in left_out for camera in range(len(self._names))])
 
@@ -201,7 +206,8 @@ class CameraMonitor:
             more = f" ({because})" if because else ""
             lines.append(f"camera {self._names[int(camera)]} {reason}{more}: left out of {described(*span)}")
         # without two views the person may also be absent, which the monitor does not know
-        status = {reason: "no pose" if reason == _TOO_FEW else "lost" for reason in self._lost}
+        outcome = {_TOO_FEW: "no pose", _JUMPED: "searched for again"}
+        status = {reason: outcome.get(reason, "lost") for reason in self._lost}
         return lines + [f"{reason}: {status[reason]}, {described(*span)}" for reason, span in self._lost.items()]
 
     def state(self) -> Mapping[str, Any]:

@@ -21,7 +21,7 @@ from tk.errors import VideoError
 from tk.io.captures.clip import Clip, Image
 from tk.io.captures.clip_folder import list_clips, probe
 from tk.io.captures.frames import FrameReader
-from tk.io.captures.video import probe_video
+from tk.io.captures.video import damaged_images, probe_video
 
 
 @pytest.fixture(autouse=True)
@@ -480,3 +480,19 @@ def test_an_open_reader_does_not_block_the_exit(tmp_path: Path) -> None:
         [sys.executable, "-c", program, str(tmp_path / "a.mp4")], capture_output=True, text=True, timeout=60, check=True
     )
     assert (done.stdout, done.stderr) == ("0\n", "")
+
+
+@pytest.mark.parametrize("name", ["video.avi", "video.mp4"])
+def test_damaged_images_are_found_in_every_container(tmp_path: Path, name: str) -> None:
+    path, rng = tmp_path / name, np.random.default_rng(0)
+    write_video(path, [rng.integers(0, 255, (64, 96, 3), np.uint8) for _ in range(12)])
+    assert damaged_images(path, 12) == []
+    data = bytearray(path.read_bytes())
+    for place in rng.integers(len(data) // 3, len(data) // 2, 200).tolist():
+        data[place] ^= 0xFF
+    path.write_bytes(data)
+    found = damaged_images(path, 12)
+    assert found and set(found) <= set(range(12))
+    path.write_bytes(data[: 2 * len(data) // 3])
+    if name.endswith("avi"):  # an MP4 that is cut off cannot be opened
+        assert set(damaged_images(path, 12)) <= set(range(12))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -74,14 +73,20 @@ def damaged_images(path: Path, stop: int) -> list[int]:
         stream = container.streams.video[0]
         stream.thread_type = "SLICE"  # threads of whole images report errors with later ones
         stream.codec_context.options = {"err_detect": "explode"}
-        for packet in islice(container.demux(stream), stop + _REORDERED):
-            if packet.pts is None:  # the last one has no image
+        packets = container.demux(stream)
+        while len(times) < stop + _REORDERED:
+            try:
+                packet = next(packets)
+            except (StopIteration, av.error.FFmpegError):  # in an error a reader fails, too
+                break
+            time = packet.dts if packet.pts is None else packet.pts  # AVI has no other times
+            if time is None:  # the last packet has no image
                 continue
-            times.append(packet.pts)
+            times.append(time)
             try:
                 packet.decode()
             except av.error.FFmpegError:
-                damaged.add(packet.pts)
+                damaged.add(time)
     return [i for i, time in enumerate(sorted(times)[:stop]) if time in damaged]
 
 
