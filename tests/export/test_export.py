@@ -175,7 +175,7 @@ def test_nothing_is_written_into_a_captures_own_folders(write: Write, tmp_path: 
     path, capture = write(), tmp_path / "capture"
     (capture / "videos").mkdir(parents=True)
     (capture / "calibration.toml").write_text("")
-    with pytest.raises(ConfigError, match=r"lies in .*videos, whose files tk reads"):
+    with pytest.raises(ConfigError, match=r"lies in .*videos, an input"):
         export(path, [kind], capture / "videos", force=True)
     assert not list((capture / "videos").iterdir())
     assert export(path, [kind], capture).files

@@ -103,7 +103,7 @@ def check_not_input(path: Path, inputs: Iterable[Path | None] = (), capture: Pat
     for part in given:
         real = resolved(part)
         if target == real or (real in target.parents and real.is_dir()):
-            where = "is an input of this command" if target == real else f"lies in {part}, whose files tk reads"
+            where = "is an input of this command" if target == real else f"lies in {part}, an input of this command"
             raise ConfigError(f"{path}: {where}; choose another name")
     if target.is_file():
         identity = _identity(target)
