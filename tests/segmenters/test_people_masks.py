@@ -98,7 +98,7 @@ def test_person_whom_one_camera_shows_is_in_its_mask() -> None:
 
 def test_nobody_is_segmented_where_nobody_is() -> None:
     segmenter = OneOfMany()
-    masks, uncertain = masks_of(segmenter).label(shown([])[0])
+    masks, uncertain, _ = masks_of(segmenter).label(shown([])[0])
     assert not masks.any() and not uncertain.any() and not segmenter.seen
 
 
@@ -113,6 +113,27 @@ def test_another_detection_of_the_same_person_changes_nothing() -> None:
     once, twice = (masks_of(segmenter).label(images) for segmenter in (OneOfMany(), Twice()))
     for a, b in zip(once, twice, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_landmarks_of_everybody_are_triangulated_where_cameras_agree() -> None:
+    """The segmenter takes the top of a mask for the shoulders, the lower end for the ankles, and sees nothing else."""
+
+    class Posed(OneOfMany):
+        def segment_pose(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+            found, landmarks = self.segment(image), np.full((12, 3), np.nan)
+            y, x = np.nonzero(found > 0.5)
+            if len(x):
+                landmarks[:2], landmarks[-2:] = (x.mean(), y.min(), 0.9), (x.mean(), y.max(), 0.9)
+            return found, landmarks
+
+    places = [(-0.6, 0.2), (0.6, -0.1)]
+    images, _ = shown(places)
+    landmarks = masks_of(Posed()).label(images).landmarks
+    assert landmarks.shape == (2, 12, 3) and np.isnan(landmarks[:, 2:-2]).all()
+    for person, at in zip(landmarks[np.argsort(landmarks[:, 0, 0])], places, strict=True):
+        np.testing.assert_allclose(person[[0, 1]], [(*at, 1.75)] * 2, atol=0.15)
+        np.testing.assert_allclose(person[[10, 11]], [(*at, 0.0)] * 2, atol=0.15)
+    assert np.isnan(masks_of(OneOfMany()).label(images).landmarks).all()
 
 
 def test_masks_do_not_change_the_images() -> None:

@@ -15,9 +15,10 @@ from tests.trackers.walker import BODY, EMPTY, NAMES, STATURE, errors, find_agai
 from tk.errors import CaptureError
 from tk.model.body.cone_body import COLOR_GROUPS, ConeBody, build_cone_body
 from tk.model.body.gait_poses import standing_pose, walking_pose
-from tk.model.body.limb_candidates import exchanged, pairs
+from tk.model.body.limb_candidates import exchanged, pairs, turned
 from tk.model.body.skeleton import JOINTS, shoulder_angles
 from tk.model.cameras.camera import Rig
+from tk.model.cues.landmarks import ROWS
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.setup import InitPose, Subject
 from tk.settings import RegionSettings, SilhouetteSettings
@@ -458,3 +459,42 @@ def test_legs_that_took_each_other_s_place_are_found_by_the_routine_search() -> 
     off = [errors(step, pose)[moved] for step in steps]
     assert off[0].max() > 0.2  # a descent alone does not exchange them
     assert off[-1].max() < CLOSE_M
+
+
+# --- landmarks --------------------------------------------------------------------------------------------------------
+
+
+def seen_at(pose: np.ndarray, noise_m: float = 0.03) -> np.ndarray:
+    """The landmarks (1, 12, 3) of a network that is some centimetres off."""
+    return SKELETON.joints(pose)[ROWS][None] + np.random.default_rng(7).normal(0.0, noise_m, (1, 12, 3))
+
+
+@pytest.mark.parametrize("wrong", ["turned", "legs"])
+def test_landmarks_correct_left_and_right(wrong: str) -> None:
+    """Silhouettes alone keep a person who was tracked back to front, or with exchanged legs."""
+    pose = POSES[2]
+    tracker = tracker_at(pose)
+    mistaken = turned(pose, tracker.limbs) if wrong == "turned" else exchanged(pose, *pairs(tracker.limbs)[1])
+    for landmarks, right in ((None, False), (seen_at(pose), True)):
+        tracker.start_at(mistaken)
+        found = tracker.step(replace(observe(MASKS[2], 0), landmarks=landmarks))
+        assert (errors(found, pose).max() < 2 * CLOSE_M) == right
+
+
+def test_landmarks_that_the_silhouettes_deny_change_nothing() -> None:
+    raised = with_arm(with_arm(POSES[0], "l", (0, 0.2, 1), 0.0), "r", (0, 0.2, 1), 0.0)
+    found = [
+        tracker_at(POSES[0]).step(replace(observe(MASKS[0], 0), landmarks=landmarks))
+        for landmarks in (None, seen_at(raised), seen_at(POSES[0]), np.full((2, 12, 3), np.nan))
+    ]
+    for other in found[1:]:
+        np.testing.assert_array_equal(other.pose, found[0].pose)
+
+
+def test_no_heading_is_doubted_that_landmarks_have_shown() -> None:
+    tracker = tracker_at(POSES[0])
+    tracker.step(replace(observe(MASKS[0], 0), landmarks=seen_at(POSES[0])))
+    same = RegionTracker(RIG, "z", SETTINGS)
+    same.restore(tracker.model(), tracker.state())
+    for known in (tracker, same):
+        assert known.heading_hypotheses([MASKS[0]], POSES[:1], None) == ()

@@ -271,7 +271,7 @@ def _read(capture: Capture, config: Settings, span: int, compared: set[int], kep
             i, watched = frame.index, read.watch.wants(frame.index)
             if not watched and i not in compared:
                 continue
-            labels, uncertain, _ = label(frame)
+            labels, uncertain, *_ = label(frame)
             if watched:
                 read.watch.look(i, labels, uncertain)
             if i in compared:

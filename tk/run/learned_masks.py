@@ -20,7 +20,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,12 +31,12 @@ from tk.model.masks.learned_scene import LearnedScene
 from tk.run.task import Task
 
 if TYPE_CHECKING:  # SciPy, which takes long to import
-    from tk.segmenters.people_masks import PeopleMasks
+    from tk.segmenters.people_masks import PeopleMasks, Segmented
 
 Masks = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
-#: a frame's number, and the segmenter's masks and uncertain pixels
-_Asked = tuple[int, Masks, Bool]
+#: a frame's number, and what the segmenter sees in it
+_Asked: TypeAlias = "tuple[int, Segmented]"
 
 #: where the masks of a camera come from, as a result stores it
 LEARNED, LEARNED_AND_SEGMENTER, SEGMENTER = range(3)
@@ -58,11 +58,10 @@ _DISAGREE = 0.65
 
 @dataclass(frozen=True)
 class _Sample:
-    """The segmenter's masks and uncertain pixels of a frame; ``agrees``: (C,) whether the learned scene agrees."""
+    """What the segmenter sees in a frame; ``agrees``: (C,) whether the learned scene agrees."""
 
     index: int
-    masks: Masks
-    uncertain: Bool
+    seen: Segmented
     agrees: Bool
 
 
@@ -113,22 +112,24 @@ class LearnedMasks:
         height, width = np.max([(h, w) for w, h in self._sizes], axis=0)
         return _SAMPLE_BYTES // (5 * self._cameras * int(height) * int(width))
 
-    def label(self, frame: FrameSet) -> tuple[Masks, Bool, NDArray[np.uint8]]:
-        """Return masks (C, H, W), uncertain pixels (C, H, W), and where each camera's mask comes from (C,)."""
+    def label(self, frame: FrameSet) -> tuple[Masks, Bool, NDArray[np.uint8], NDArray[np.float64] | None]:
+        """Return masks (C, H, W), uncertain pixels (C, H, W), where each camera's mask comes from (C,), and the
+        landmarks (N, 12, 3) if the segmenter was asked for this frame."""
         span = self._follow(frame) if self._source.frame_count is None else self._span_of(frame.index)
         before, after = span.around(frame.index) if span.samples else (None, None)
         asked = before is not None and before is after and before.index == frame.index
         if span.foreground is None or before is None or after is None:
-            found = (before.masks, before.uncertain) if before and asked else self._people.label(frame.images)
-            return *found, np.full(self._cameras, SEGMENTER, np.uint8)
+            seen = before.seen if before and asked else self._people.label(frame.images)
+            return seen.masks, seen.uncertain, np.full(self._cameras, SEGMENTER, np.uint8), seen.landmarks
         masks, uncertain = span.foreground.label(frame.images, _between(before, after))
         kind = np.full(self._cameras, LEARNED_AND_SEGMENTER if asked else LEARNED, np.uint8)
-        failed = ~(before.agrees & after.agrees)
+        failed, landmarks = ~(before.agrees & after.agrees), before.seen.landmarks if asked else None
         if failed.any():
-            again = (before.masks, before.uncertain) if asked else self._people.label(frame.images)
-            masks[failed], uncertain[failed] = again[0][failed], again[1][failed]
+            seen = before.seen if asked else self._people.label(frame.images)
+            masks[failed], uncertain[failed] = seen.masks[failed], seen.uncertain[failed]
             kind[failed] = SEGMENTER
-        return self._people.without_specks(masks), uncertain, kind
+            landmarks = seen.landmarks
+        return self._people.without_specks(masks), uncertain, kind, landmarks
 
     def _span_of(self, index: int) -> _Span:
         within = min(max(index, self._edges[0]), self._edges[-1] - 1)
@@ -150,7 +151,7 @@ class LearnedMasks:
         for frame in self._reading:
             if frame.index in chosen:
                 images.append(frame.images.copy())
-                samples.append((frame.index, *self._people.label(frame.images)))
+                samples.append((frame.index, self._people.label(frame.images)))
             if frame.index + 1 >= stop:
                 break
         self._next = stop
@@ -163,7 +164,7 @@ class LearnedMasks:
         learned so far, with the last sample."""
         if frame.index < self._span.stop:
             return self._span
-        sample = (frame.index, *self._people.label(frame.images))
+        sample = (frame.index, self._people.label(frame.images))
         self._past.append((frame.images.copy(), sample))
         self._asked += 1
         foreground = self._span.foreground
@@ -174,7 +175,7 @@ class LearnedMasks:
         return self._span
 
     def _foreground(self, images: Sequence[Masks], samples: Sequence[_Asked]) -> CollinearityForeground:
-        scene = LearnedScene.learn(images, [s[1] for s in samples], [s[2] for s in samples])
+        scene = LearnedScene.learn(images, [s.masks for _, s in samples], [s.uncertain for _, s in samples])
         return CollinearityForeground.of_learned(scene, self._sizes, self._settings.foreground)
 
     def _chosen(self, begin: int, stop: int) -> list[int]:
@@ -190,12 +191,12 @@ class LearnedMasks:
 
 def _checked(foreground: CollinearityForeground | None, images: Masks, asked: _Asked) -> _Sample:
     """Return a sample, compared with the segmentation of its images against the learned scene."""
-    index, masks, uncertain = asked
+    index, seen = asked
     if foreground is None:
-        return _Sample(index, masks, uncertain, np.zeros(len(masks), np.bool_))
-    found = foreground.label(images, (masks, uncertain))[0]
-    one, either = (np.count_nonzero(pixels, axis=(1, 2)) for pixels in (found ^ masks, found | masks))
-    return _Sample(index, masks, uncertain, one <= _DISAGREE * either)
+        return _Sample(index, seen, np.zeros(len(seen.masks), np.bool_))
+    found = foreground.label(images, (seen.masks, seen.uncertain))[0]
+    one, either = (np.count_nonzero(pixels, axis=(1, 2)) for pixels in (found ^ seen.masks, found | seen.masks))
+    return _Sample(index, seen, one <= _DISAGREE * either)
 
 
 def _edges(first: int, count: int | None, fps: float) -> list[int]:
@@ -209,6 +210,7 @@ def _edges(first: int, count: int | None, fps: float) -> list[int]:
 def _between(before: _Sample, after: _Sample) -> tuple[Masks, Bool]:
     """Return what two samples say of the pixels between them: those of the person, and those that may be."""
     if before is after:
-        return before.masks, before.uncertain
-    person = before.masks & after.masks
-    return person, (before.masks > person) | (after.masks > person) | before.uncertain | after.uncertain
+        return before.seen.masks, before.seen.uncertain
+    one, other = before.seen, after.seen
+    person = one.masks & other.masks
+    return person, (one.masks > person) | (other.masks > person) | one.uncertain | other.uncertain

@@ -131,11 +131,13 @@ def observe(
             if film is not None:
                 film.put(frame.index, [image[:h, :w] for image, (h, w) in zip(frame.images, shapes, strict=True)], note)
             watch.lap("decode")
-            masks, uncertain, sources = label(frame)
+            masks, uncertain, sources, landmarks = label(frame)
             images = frame.images if keep_images else np.empty((len(masks), 0, 0, 3), np.uint8)
             watch.lap("masks")
             yield (
-                Observation(frame.index, images, masks, uncertain if keep_images else None, frame.time, sources),
+                Observation(
+                    frame.index, images, masks, uncertain if keep_images else None, frame.time, sources, landmarks
+                ),
                 watch,
             )
 
@@ -184,6 +186,7 @@ class _Ready:
     time: float
     uncertain: bool
     sources: NDArray[np.uint8] | None
+    landmarks: NDArray[np.float64] | None
     laps: Mapping[str, float]
 
 
@@ -280,9 +283,8 @@ class Ahead:
             slot = slot.copy()
             self._send(ready.slot)
         images, masks, uncertain = self._layout.layers(slot)
-        return Observation(
-            ready.index, images, masks, uncertain if ready.uncertain else None, ready.time, ready.sources
-        )
+        unsure = uncertain if ready.uncertain else None
+        return Observation(ready.index, images, masks, unsure, ready.time, ready.sources, ready.landmarks)
 
     def _collect(self) -> None:
         """Make the dropped frames' slots free."""
@@ -369,6 +371,7 @@ class _Slots:
                 observation.time,
                 observation.uncertain is not None,
                 observation.sources,
+                observation.landmarks,
                 watch.laps,
             )
         )

@@ -27,11 +27,13 @@ class Labels(NamedTuple):
     Attributes:
         masks, uncertain: as an :class:`~tk.trackers.protocol.Observation` has them.
         sources: (C,) uint8, where a segmenter's masks come from, see :mod:`tk.run.learned_masks`; None for others.
+        landmarks: as an :class:`~tk.trackers.protocol.Observation` has them.
     """
 
     masks: NDArray[np.uint8]
     uncertain: NDArray[np.bool_] | None = None
     sources: NDArray[np.uint8] | None = None
+    landmarks: NDArray[np.float64] | None = None
 
 
 Labeller = Callable[[FrameSet], Labels]

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
+from tk.model.cues.landmarks import LANDMARKS
 
 if TYPE_CHECKING:
     from tk.model.masks.sightings import Sighting
@@ -46,6 +47,18 @@ class Finder(Protocol):
         ...
 
 
+@runtime_checkable
+class PoseSegmenter(Protocol):
+    """A segmenter that also sees where the person's joints are."""
+
+    def segment_pose(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """Return the probability (h, w) of :meth:`Segmenter.segment`, and the landmarks (12, 3) of the same person, in
+        the order of :data:`tk.model.cues.landmarks.LANDMARKS`: x, y, pixels of the image (h, w, 3), and confidence, 0
+        to 1; NaN if there is nobody.
+        """
+        ...
+
+
 def names() -> tuple[str, ...]:
     """Return the installed segmenters; those of other packages first, because the user chose to install them."""
     others = sorted({entry.name for entry in entry_points(group=GROUP)})
@@ -74,13 +87,19 @@ def load(name: str) -> Segmenter:
     return BlazePose()
 
 
-def probabilities(segmenter: Segmenter, name: str, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return the checked result of a segmenter for an image.
+def segmented(
+    segmenter: Segmenter, name: str, image: NDArray[np.uint8]
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Return the checked result of a segmenter for an image: the probabilities, and the landmarks, NaN without any.
 
     Raises:
         ConfigError: the result is not a probability for each pixel.
     """
-    found = np.asarray(segmenter.segment(image))
+    landmarks = np.full((len(LANDMARKS), 3), np.nan)
+    if isinstance(segmenter, PoseSegmenter):
+        found, landmarks = segmenter.segment_pose(image)
+    else:
+        found = np.asarray(segmenter.segment(image))
     if found.shape != image.shape[:2] or found.dtype.kind != "f":
         raise ConfigError(
             f"segmenter {name}: returned an array {found.shape} of {found.dtype} for an image {image.shape[:2]}; "
@@ -90,4 +109,4 @@ def probabilities(segmenter: Segmenter, name: str, image: NDArray[np.uint8]) -> 
         raise ConfigError(
             f"segmenter {name}: returned values outside 0 to 1; it must return a probability for each pixel"
         )
-    return found.astype(np.float32, copy=False)
+    return found.astype(np.float32, copy=False), landmarks

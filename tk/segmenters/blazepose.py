@@ -1,9 +1,9 @@
 """MediaPipe's pose networks (BlazePose; Bazarevsky et al. 2020), run with LiteRT: detect people, segment one person.
 
 The detector returns each person's mid-hip point and the radius of a circle around it that contains the whole body. The
-pose network gets an upright square with one person and returns landmarks, which are not used here, and a mask of
-256×256. The pre- and postprocessing is that of MediaPipe, with two differences: no state is kept between frames, and
-the caller, who has several cameras, chooses the square.
+pose network gets an upright square with one person and returns landmarks and a mask of 256×256. The pre- and
+postprocessing is that of MediaPipe, with two differences: no state is kept between frames, and the caller, who has
+several cameras, chooses the square.
 """
 
 from __future__ import annotations
@@ -28,6 +28,11 @@ _DETECTOR_SIDE, _POSE_SIDE = 224, 256
 _GRIDS = ((28, 2), (14, 2), (7, 6))
 _HIPS, _CIRCLE = slice(4, 6), slice(6, 8)  # columns: mid-hip point, point on the circle around the body
 _LEAST_SCORE = 0.5  # MediaPipe's value
+# The pose network's points, each with x, y, z, visibility, presence (MediaPipe's tensors_to_pose_landmarks); and those
+# of LANDMARKS among them: shoulders, elbows, wrists, hips, knees, ankles.
+_POINTS, _COLUMNS = 39, 5
+_VISIBLE = 3  # column, a logit
+_USED = [11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28]
 # Detections whose mid-hip points differ by less than this share of the radius are one person. Detections of one person
 # differ by far less, different people by more. Half and twice the value change the mean errors of walk and pair without
 # an empty scene (55 frames) by 0.01 cm.
@@ -72,13 +77,24 @@ class BlazePose:
 
     def segment(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the probability (h, w) that each pixel shows the person in the middle of the image (h, w, 3)."""
+        return self.segment_pose(image)[0]
+
+    def segment_pose(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """See :class:`~tk.segmenters.PoseSegmenter`."""
         height, width = image.shape[:2]
-        square, _ = _in_square(image, _POSE_SIDE)
-        (logits,) = (a for a in self._pose(square / np.float32(255)) if a.shape[1:3] == (_POSE_SIDE,) * 2)
+        square, scale = _in_square(image, _POSE_SIDE)
+        found = self._pose(square / np.float32(255))
+        (logits,) = (a for a in found if a.shape[1:3] == (_POSE_SIDE,) * 2)
+        (rows,) = (a.reshape(-1, _COLUMNS) for a in found if a.size == _POINTS * _COLUMNS)
+        used = rows[_USED].astype(np.float64)
+        landmarks = np.column_stack([(used[:, :2] + 0.5) / scale - 0.5, _probability(used[:, _VISIBLE])])
+        (present,) = (float(a.item()) for a in found if a.size == 1)
+        if not present >= _LEAST_SCORE:
+            landmarks[:] = np.nan
         side = max(height, width)
         # enlarged before thresholding, so that the outline is finer than the network's pixels
         whole = cv2.resize(logits[0, :, :, 0], (side, side), interpolation=cv2.INTER_LINEAR)
-        return np.asarray(1 / (1 + np.exp(-np.clip(whole[:height, :width], -50, 50))), np.float32)
+        return np.asarray(_probability(whole[:height, :width]), np.float32), landmarks
 
 
 class _Network:
@@ -98,6 +114,10 @@ class _Network:
         self._interpreter.set_tensor(self._input, image[None].astype(np.float32))
         self._interpreter.invoke()
         return [self._interpreter.get_tensor(index) for index in self._outputs]
+
+
+def _probability(logit: NDArray[Any]) -> NDArray[Any]:
+    return np.asarray(1 / (1 + np.exp(-np.clip(logit, -50, 50))))
 
 
 @contextmanager

@@ -24,16 +24,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.model.cameras.camera import Rig
+from tk.model.cameras.triangulation import triangulate_joints
 from tk.model.cameras.volume import Volume
+from tk.model.cues.landmarks import LANDMARKS
 from tk.model.hull.coarse import CoarseHull
 from tk.model.masks.sightings import Patch, SeenPerson, Sighting, locate, volume_patch
-from tk.segmenters import Finder, Segmenter, probabilities
+from tk.segmenters import Finder, Segmenter, segmented
 
 Images = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
@@ -68,13 +71,30 @@ class _Person:
     Attributes:
         patches: one per camera.
         masks, uncertain: (C, H, W) uint8, 0 or 255, and bool.
+        landmarks: (C, 12, 3) x, y, pixels, and confidence; NaN where there are none.
         round: round of the search in which the person was found; those of earlier ones were painted over.
     """
 
     patches: list[Patch]
     masks: Images
     uncertain: Bool
+    landmarks: NDArray[np.float64]
     round: int
+
+
+class Segmented(NamedTuple):
+    """What a segmenter sees in a frame set.
+
+    Attributes:
+        masks: (C, H, W) uint8, 0 or 255.
+        uncertain: (C, H, W) bool, where the mask is 0.
+        landmarks: (N, 12, 3) m, of each person, see :data:`~tk.model.cues.landmarks.LANDMARKS`; NaN where no two
+            cameras agree.
+    """
+
+    masks: Images
+    uncertain: Bool
+    landmarks: NDArray[np.float64]
 
 
 class PeopleMasks:
@@ -92,15 +112,17 @@ class PeopleMasks:
         Raises:
             ConfigError: the segmenter does not return probabilities.
         """
-        return self.label(images)[0]
+        return self.label(images).masks
 
-    def label(self, images: Images) -> tuple[Images, Bool]:
-        """Return the masks, and their uncertain pixels (C, H, W) bool, where the mask is 0."""
+    def label(self, images: Images) -> Segmented:
+        """Return what the segmenter sees in images (C, H, W, 3); see :meth:`segment`."""
         masks, uncertain = np.zeros(images.shape[:3], np.uint8), np.zeros(images.shape[:3], np.bool_)
-        for person in self._people(images):
+        people = self._people(images)
+        for person in people:
             masks |= person.masks
             uncertain |= person.uncertain
-        return masks, uncertain & (masks == 0)
+        landmarks = np.array([triangulate_joints(self._rig, person.landmarks)[0] for person in people])
+        return Segmented(masks, uncertain & (masks == 0), landmarks.reshape(-1, len(LANDMARKS), 3))
 
     def without_specks(self, masks: Images) -> Images:
         """Return masks (C, H, W) without small parts that no other camera shows: shadows, reflections."""
@@ -210,7 +232,7 @@ class PeopleMasks:
                 for other, masks in zip(people, first, strict=True):
                     if other is not person:
                         self._paint(painted, c, masks[c], other.patches[c])
-                found = self._probability(painted, c, person.patches[c])
+                found, person.landmarks[c] = self._seen(painted, c, person.patches[c])
                 near = self._hull.near(self._hull.subject(person.masks, but=c), c, images.shape[1:3])
                 person.uncertain[c] |= (found > _UNCERTAIN) & near
                 person.masks[c][(found > 0.5) & near] = 255
@@ -224,21 +246,23 @@ class PeopleMasks:
 
     def _empty(self, patches: Sequence[Patch], number: int = 0) -> _Person:
         shape = len(self._rig), *self._rig.frame_shape
-        return _Person(list(patches), np.zeros(shape, np.uint8), np.zeros(shape, np.bool_), number)
+        landmarks = np.full((len(self._rig), len(LANDMARKS), 3), np.nan)
+        return _Person(list(patches), np.zeros(shape, np.uint8), np.zeros(shape, np.bool_), landmarks, number)
 
     def _segment(self, images: Images, c: int, person: _Person) -> None:
-        """Give the segmenter the square of a person in an image; replace the mask."""
-        found = self._probability(images[c], c, person.patches[c])
+        """Give the segmenter the square of a person in an image; replace the mask and the landmarks."""
+        found, person.landmarks[c] = self._seen(images[c], c, person.patches[c])
         person.masks[c] = np.where(found > 0.5, 255, 0)
         person.uncertain[c] = (found > _UNCERTAIN) & (found <= 0.5)
 
-    def _probability(self, image: Images, c: int, patch: Patch) -> NDArray[np.float32]:
-        """Return the probability (H, W) of each pixel to show the person in the middle of a square; 0 outside it."""
+    def _seen(self, image: Images, c: int, patch: Patch) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """Return the probability (H, W) of each pixel to show the person in the middle of a square, 0 outside it; and
+        the person's landmarks (12, 3) in the image."""
         whole = np.zeros(image.shape[:2], np.float32)
         picture = self._shown(image, c)
-        found = probabilities(self._segmenter, self._name, patch.cut(picture))
+        found, landmarks = segmented(self._segmenter, self._name, patch.cut(picture))
         self._shown(whole, c)[...] = patch.paste(found, picture.shape[:2])
-        return whole
+        return whole, np.column_stack([patch.in_image(landmarks[:, :2]), landmarks[:, 2]])
 
     def _shown(self, image: NDArray, c: int) -> NDArray:
         """Return the part (h, w) of a padded image (H, W) that the camera shows."""

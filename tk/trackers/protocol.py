@@ -39,6 +39,8 @@ class Observation:
             the scene's colour. A body part there costs half. None if unknown.
         time: time stamp of the source, seconds.
         sources: (C,) uint8, where a segmenter's masks come from, see :mod:`tk.run.learned_masks`; None for others.
+        landmarks: (N, 12, 3) m, joints of all people in view by a segmenter's network, see
+            :mod:`tk.model.cues.landmarks`; NaN where they are unknown. None if no network saw this frame.
     """
 
     index: int
@@ -47,6 +49,7 @@ class Observation:
     uncertain: NDArray[np.bool_] | None = None
     time: float = 0.0
     sources: NDArray[np.uint8] | None = None
+    landmarks: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)

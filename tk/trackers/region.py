@@ -27,12 +27,14 @@ from numpy.typing import NDArray
 from tk.kernels.mask_values import PERSON
 from tk.kernels.silhouette import normal_equations
 from tk.model.body.body_fit import STATURE_DEVIATION
+from tk.model.body.initial_pose import pose_of_joints
 from tk.model.body.joint_sigma import VIEW_M, contour_variance, directions, posture_variance, view_variance
 from tk.model.body.limb_candidates import Limb, turned
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.bundle import CORRELATION_PX
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import determine_depth
+from tk.model.cues.landmarks import ROWS, contradiction, of_person
 from tk.model.cues.part_colors import color_bins
 from tk.model.cues.ray_costs import Evidence
 from tk.model.cues.visible_contours import contour_shares
@@ -73,6 +75,8 @@ ANGLE_DEG, TRANSLATION_M = 40.0, 0.3
 # fold, cube, punch and kick with all, three and two cameras it is 1.67 to 2.4 in the median of 20 frames; of small
 # pictures of a walk of 14 frames 1.21; of a person with poor masks 1.05, and 1.00 or less if back was taken for front.
 AMBIGUOUS_HEADING = 1.15
+# Landmarks contradict a pose if they are farther from its trunk, arms or legs than this, metres.
+CONTRADICTED_M = 0.2
 # After this many consecutive frames with a high residual, and two failed searches for the person, sigma is set to NaN.
 UNKNOWN_AFTER = 2 * RECOVER_EVERY
 # Masks are searched for carried objects if this share of their pixels has colours that are not the person's; objects
@@ -133,6 +137,7 @@ class RegionTracker(ContourTracker):
         self._mean_posture: Float = np.zeros((len(JOINTS), 3))
         self._postures = 0
         self._fresh = True
+        self._heading_known = False  # landmarks have shown it
         self.view_m = VIEW_M
         self._reset()
 
@@ -164,6 +169,8 @@ class RegionTracker(ContourTracker):
         self, masks: Sequence[NDArray[np.uint8]], poses: Float, height_m: float | None
     ) -> tuple[RegionTracker, ...]:
         """See :class:`~tk.trackers.protocol.TwoPassTracker`."""
+        if self._heading_known:
+            return ()
         seen = [self.views.pyramid(shown, self.solver.scales, False) for shown in masks]
         both = np.array([
             self.settle(pyramid, np.stack([pose, turned(pose, self.limbs)])).states
@@ -213,6 +220,8 @@ class RegionTracker(ContourTracker):
             self._propose(frame, pyramid, evidence, images, misplaced)
             if self._best.pose is not settled:
                 look = self._look(evidence, pyramid, images)
+        if frame.landmarks is not None and self._contradicted(frame.landmarks, pyramid, evidence, images):
+            look = self._look(evidence, pyramid, images)
         watch.lap("search")
         followed = self._best.pose
         lost = self._recover(pyramid, look.error)
@@ -363,6 +372,28 @@ class RegionTracker(ContourTracker):
         ]
         self._rank()
 
+    def _contradicted(
+        self, landmarks: Float, pyramid: Pyramid, evidence: Evidence, images: NDArray[np.uint8] | None
+    ) -> bool:
+        """If landmarks contradict the best pose, and the silhouettes allow the pose that they show, take that for the
+        best one; return whether that is so."""
+        skeleton, best = self.body.skeleton, self._best
+        joints = skeleton.joints(best.pose)
+        seen = of_person(self.world.points_in(landmarks), joints)
+        if seen is None:
+            return False
+        self._heading_known = True
+        if contradiction(seen, joints) < CONTRADICTED_M:
+            return False
+        known = np.isfinite(seen).all(axis=1)
+        start = pose_of_joints(skeleton, ROWS[known], seen[known])[None]
+        pose = self.settle(pyramid, start, images=images, prior=self.prior(start)).states[0]
+        more = float(np.diff(evidence.costs(self.body, np.stack([best.pose, pose])))[0])
+        if contradiction(seen, skeleton.joints(pose)) >= CONTRADICTED_M or more > MARGIN:
+            return False
+        self._alive = [Hypothesis(pose, pose, best.cost + more)]
+        return True
+
     def _recover(self, pyramid: Pyramid, by_view: Float) -> bool:
         """Return whether the person is lost; if so, or if the residual (E_S, (V,)) stays high, search for the person
         as at the start. Searches for the second reason become rarer: after 3, 6, 12 … frames."""
@@ -491,6 +522,7 @@ class RegionTracker(ContourTracker):
             "lost_for": self._lost_for,
             "high_for": self._high_for,
             "view_m": self.view_m,
+            "heading_known": self._heading_known,
             **self.colors.state(),
         }
 
@@ -503,6 +535,7 @@ class RegionTracker(ContourTracker):
         self._lost_for = int(state["lost_for"])
         self._high_for = int(state["high_for"])
         self.view_m = float(state["view_m"])
+        self._heading_known = bool(state["heading_known"])
         self.colors.restore(state)
         self._fresh = False
 

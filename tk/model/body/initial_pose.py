@@ -53,10 +53,10 @@ def rough_pose(
         return dimensions, skeleton, world.poses_in(skeleton.clip(pose))
     skeleton = build_skeleton(dimensions, paper=True)
     rows = np.array([JOINTS.index(name) for name in joints])
-    return dimensions, skeleton, _fitted(skeleton, rows, world.points_in(list(joints.values())))
+    return dimensions, skeleton, pose_of_joints(skeleton, rows, world.points_in(list(joints.values())))
 
 
-def _fitted(skeleton: Skeleton, rows: NDArray[np.int64], targets: Float) -> Float:
+def pose_of_joints(skeleton: Skeleton, rows: NDArray[np.int64], targets: Float) -> Float:
     """Return the pose (D,) within the limits whose joints ``rows`` (N,) are closest to targets (N, 3), metres.
 
     The best of several headings is returned.

@@ -79,6 +79,11 @@ class Patch:
         """Return its values (side, side) in an image of this shape (h, w), 0 elsewhere."""
         return np.asarray(cv2.warpAffine(values, self._to_image(), shape[::-1], flags=cv2.INTER_LINEAR), np.float32)
 
+    def in_image(self, points: Float) -> Float:
+        """Return its pixels (N, 2) as pixels (N, 2) of the image."""
+        affine = self._to_image()
+        return np.asarray(points @ affine[:, :2].T + affine[:, 2])
+
     def _to_image(self) -> Float:
         """Return (2, 3) the affine map from its pixels to the image's."""
         turn, middle = _turn(self.angle), (self.side - 1) / 2
