@@ -34,7 +34,7 @@ from tk.run.choice import chosen, matched, unknown
 from tk.run.identity import EXCHANGED, UNCLEAR, Contact, Contacts, outcome_of
 from tk.run.member import Member, Tracked, below
 from tk.run.task import Task
-from tk.trackers.camera_monitor import CameraMonitor, opening_agreement, spread_over
+from tk.trackers.camera_monitor import CameraMonitor, spread_over
 from tk.trackers.protocol import Estimate, Observation, Tracker, sharing
 from tk.trackers.sharing import UNKNOWN_BY_HULLS, PixelOwners, assign, cast_points
 
@@ -228,12 +228,9 @@ class People:
             member: the person.
             frames: the person's share of the opening.
             hull_m: height of the visual hull in the first frame.
-            whole: the opening with everybody's masks. They are compared if those of the person alone cannot be:
-                cameras that do not belong together show several people where one is.
+            whole: the opening with everybody's masks.
         """
-        seen = member.monitor.start(frames)
-        if whole and not member.monitor.tested and (refusal := opening_agreement(self._setup, whole).refusal):
-            raise CaptureError(refusal)
+        seen = member.monitor.start(frames, whole)
         member.tracker.start(seen, replace(member.subject, hull_m=hull_m))
         member.monitor.check_body()
 

@@ -73,7 +73,6 @@ class CameraMonitor:
         C = len(self._names)
         self.unfit = np.zeros(C, bool)  # cameras that their image excludes from the last frame
         self._excluded = np.zeros(C, bool)
-        self._tested = False
         self._judge = ResidualJudge(tracker, setup.rig) if isinstance(tracker, RegionTracker) else None
         self._spans: dict[str, Span] = {}  # of exclusion, by "camera/reason"
         self._lost: dict[str, Span] = {}  # losses and jumps, by reason
@@ -82,8 +81,13 @@ class CameraMonitor:
         self._was_lost = np.zeros((), bool)  # whether the last frame has no pose
         self._excess = 0.0  # of this frame, mean over the cameras used; 0 if it was not tested
 
-    def start(self, frames: Sequence[Observation]) -> list[Observation]:
+    def start(self, frames: Sequence[Observation], whole: Sequence[Observation] = ()) -> list[Observation]:
         """Return the opening frames without the cameras that are wrong, for the tracker's start.
+
+        Args:
+            frames: the person's share of the opening.
+            whole: the opening with everybody's masks. They are compared where those of the person alone show too
+                little: cameras that do not belong together show several people where one is.
 
         Raises:
             CaptureError: the cameras contradict each other, or the person's size contradicts the height in
@@ -93,9 +97,10 @@ class CameraMonitor:
         bad = np.array([self._bad(health.look(f.images, f.masks)) for f in frames])
         shown = [without_cameras(f, b) for f, b in zip(frames, bad, strict=True)]
         agreement = opening_agreement(self._setup, shown)
+        if whole and (agreement.refusal or np.count_nonzero(agreement.tested_right) < 2):
+            agreement = opening_agreement(self._setup, whole)
         if agreement.refusal:
             raise CaptureError(agreement.refusal)
-        self._tested = int(agreement.tested_right.sum()) >= 2
         if self._judge is not None:
             self._judge.tracker.view_m = float(np.hypot(VIEW_M, agreement.undetected_m))
         for camera in agreement.wrong:
@@ -110,11 +115,6 @@ class CameraMonitor:
         if self._subject.height_m is not None and alone:
             check_extent(agreement.extent_m, self._subject.height_m)
         return [without_cameras(f, self._excluded) for f in shown]
-
-    @property
-    def tested(self) -> bool:
-        """Whether the silhouettes of two cameras or more could be compared before the start, and agreed."""
-        return self._tested
 
     def check_body(self) -> None:
         """Refuse a body of an impossible size, after the tracker's start.

@@ -383,13 +383,14 @@ class RegionTracker(ContourTracker):
         if seen is None:
             return False
         self._heading_known = True
-        if contradiction(seen, joints) < CONTRADICTED_M:
+        before = contradiction(seen, joints)
+        if before < CONTRADICTED_M:
             return False
         known = np.isfinite(seen).all(axis=1)
         start = pose_of_joints(skeleton, ROWS[known], seen[known])[None]
         pose = self.settle(pyramid, start, images=images, prior=self.prior(start)).states[0]
         more = float(np.diff(evidence.costs(self.body, np.stack([best.pose, pose])))[0])
-        if contradiction(seen, skeleton.joints(pose)) >= CONTRADICTED_M or more > MARGIN:
+        if contradiction(seen, skeleton.joints(pose)) >= before or more > MARGIN:
             return False
         self._alive = [Hypothesis(pose, pose, best.cost + more)]
         return True
