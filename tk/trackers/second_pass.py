@@ -6,11 +6,11 @@ frame stays near its pose of the first pass, because that has used colours to lo
 This matters with the same body and cameras, too: without it, the limbs' mean error on the eight captures is 0.03 cm
 larger, with two cameras 0.1 cm, and more limbs stay more than 10 cm off.
 
-The first pass may have misplaced an arm, or exchanged the legs, for a while. So other poses of the limbs are tracked
-through the whole recording, forwards and backwards. They begin at the limbs' pose in the neighbouring frame, or at the
-exchanged legs. A hidden Markov model with two states, the present and the other pose, gives the probability of either
-in each frame, from the costs in all frames and the lengths of the joints' steps (Rabiner, Proc. IEEE, 1989). The pose
-becomes the likelier one, and σ includes the difference.
+The first pass may have misplaced an arm, exchanged the legs, or taken the back for the front, for a while. So other
+poses of the body and of its arms are tracked through the whole recording, forwards and backwards. They begin at the
+pose in the neighbouring frame, or at the exchanged legs. A hidden Markov model with two states, the present and the
+other pose, gives the probability of either in each frame, from the costs in all frames and the lengths of the joints'
+steps (Rabiner, Proc. IEEE, 1989). The pose becomes the likelier one, and σ includes the difference.
 """
 
 from __future__ import annotations
@@ -145,7 +145,8 @@ class SecondPass:
         arms = [Alternative(limb.dofs, limb) for limb in self.tracker.limbs if limb.name.startswith("arm")]
         rest = np.setdiff1d(np.arange(self.poses.shape[1]), np.concatenate([arm.dofs for arm in arms]))
         legs = tuple(limb for limb in self.tracker.limbs if limb.name.startswith("leg"))
-        alternatives = [Alternative(rest), Alternative(rest, legs=legs), *arms]
+        every = np.arange(self.poses.shape[1])
+        alternatives = [Alternative(every), Alternative(rest, legs=legs), *arms]
         for step in (1, -1):
             for one, poses, cost in zip(alternatives, *self._track(alternatives, step), strict=True):
                 other = self.poses.copy()
