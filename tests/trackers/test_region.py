@@ -414,7 +414,7 @@ def test_sigma_is_large_if_two_poses_have_similar_costs() -> None:
 def test_second_pass_finds_legs_that_were_exchanged_in_most_frames() -> None:
     tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=1 / 3))
     legs = pairs(tracker.limbs)[1]
-    first = np.array([exchanged(pose, *legs) for pose in POSES[:4]] + list(POSES[4:]))
+    first = np.array([exchanged(pose, [legs])[0] for pose in POSES[:4]] + list(POSES[4:]))
     masks = draw_silhouettes(BODY, RIG, POSES)
     poses, _, sigma = tracker.second_pass(masks, first, np.zeros(6, bool), np.zeros((6, 3, 2)), None, True)
     moved = [joint for leg in legs for joint in leg.joints]
@@ -453,7 +453,7 @@ def test_legs_that_took_each_other_s_place_are_found_by_the_routine_search() -> 
     pose = POSES[0]
     tracker = tracker_at(pose, contours=replace(SETTINGS, search_every=1 / 3))
     _, legs = pairs(tracker.limbs)
-    tracker.start_at(exchanged(pose, *legs))
+    tracker.start_at(exchanged(pose, [legs])[0])
     moved = [joint for leg in legs for joint in leg.joints]
     steps = (tracker.step(observe(MASKS[0], 1 + i)) for i in range(tracker.search_frames))
     off = [errors(step, pose)[moved] for step in steps]

@@ -60,8 +60,7 @@ class LimbSearch:
         """
         moved = [(limb.dofs, self._moved(limb, level, limb in misplaced, rng)) for limb in self._limbs]
         found = [(dofs, poses) for dofs, poses in moved if len(poses)]
-        swaps = np.array([exchanged(self._pose, *pair) for pair in pairs(self._limbs)])
-        swaps = self._settle(swaps, (level, 0), None)
+        swaps = self._settle(exchanged(self._pose, pairs(self._limbs)), (level, 0), None)
         swaps = swaps[self._evidence.costs(self._body, swaps) < self.own + PROMISING]
         poses = [*swaps, *(one for _, some in found for one in some)]
         for i, (_, first) in enumerate(found):

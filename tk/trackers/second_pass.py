@@ -208,7 +208,7 @@ class SecondPass:
             poses[np.ix_(follows, one.dofs)] = self.poses[np.ix_(lasts[follows], one.dofs)]
         elif every:
             for n in np.flatnonzero(follows & (frames % every == 0)).tolist():
-                poses[n] = exchanged(poses[n], *one.legs)
+                poses[n] = exchanged(poses[n], [one.legs])[0]
         return poses
 
     def _settled(

@@ -104,7 +104,7 @@ def test_exchanged_legs_are_at_each_other_s_places_within_the_limits(phase):
     skeleton = BODY.skeleton
     _, (left, right) = pairs(limbs_of(BODY))
     pose = walking_pose(skeleton, phase)
-    result = exchanged(pose, left, right)
+    result = exchanged(pose, [(left, right)])[0]
     before, after = skeleton.joints(pose), skeleton.joints(result)
     moved = left.joints + right.joints
     assert np.linalg.norm(after[moved] - before[right.joints + left.joints], axis=1).max() < 0.06

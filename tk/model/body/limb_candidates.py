@@ -112,38 +112,47 @@ def pairs(limbs: Sequence[Limb]) -> list[tuple[Limb, ...]]:
     return [tuple(pair) for pair in kinds if len(pair) == 2]
 
 
-def exchanged(pose: Float, one: Limb, other: Limb) -> Float:
-    """Return a pose (D,) with the joints of two legs, or arms, at each other's places as nearly as the limits allow.
+def exchanged(pose: Float, both: Sequence[tuple[Limb, ...]]) -> Float:
+    """Return a pose (N, D) for each of N pairs of limbs: the pose (D,) with their joints at each other's places as
+    nearly as the limits allow.
 
     Their angles are exchanged, then corrected by damped Gauss-Newton steps, since the limbs begin at different joints.
     """
-    result = pose.copy()
-    result[one.dofs], result[other.dofs] = pose[other.dofs], pose[one.dofs]
-    return _placed(result, one, other, one.skeleton.joints(pose)[other.joints + one.joints])
+    joints, together = both[0][0].skeleton.joints(pose), pose.copy()
+    for one, other in both:
+        together[one.dofs], together[other.dofs] = pose[other.dofs], pose[one.dofs]
+    together = _placed(together, both, joints)
+    result = np.repeat(pose[None], len(both), axis=0)
+    for row, pair in zip(result, both, strict=True):
+        for limb in pair:
+            row[limb.dofs] = together[limb.dofs]
+    return result
 
 
 def turned(pose: Float, limbs: Sequence[Limb]) -> Float:
     """Return a pose (D,) with the opposite heading: the trunk leans as before, and each limb is at the place of that of
     the other side, as nearly as the limits allow."""
-    skeleton = limbs[0].skeleton
-    joints, result = skeleton.joints(pose), pose.copy()
+    skeleton, both = limbs[0].skeleton, pairs(limbs)
+    result = pose.copy()
     result[skeleton.index("torso_yaw")] += np.pi
     result[[skeleton.index(name) for name in LEANS]] *= -1.0
-    for one, other in pairs(limbs):
+    for one, other in both:
         result[one.dofs], result[other.dofs] = pose[other.dofs], pose[one.dofs]
-        result = _placed(result, one, other, joints[other.joints + one.joints])
-    return result
+    return _placed(result, both, skeleton.joints(pose))
 
 
-def _placed(pose: Float, one: Limb, other: Limb, target: Float) -> Float:
-    """Return a pose (D,) whose joints of two limbs are as near to targets (4, 3) as the limits allow."""
-    skeleton, dofs, moved = one.skeleton, np.concatenate([one.dofs, other.dofs]), one.joints + other.joints
-    result = pose.copy()
+def _placed(pose: Float, both: Sequence[tuple[Limb, ...]], joints: Float) -> Float:
+    """Return a pose (D,) whose joints of each pair are as near to each other's places among ``joints`` (J, 3) as the
+    limits allow. Pairs do not depend on each other."""
+    skeleton, result = both[0][0].skeleton, pose.copy()
     for _ in range(_EXCHANGE_STEPS):
-        J = skeleton.joint_jacobian(result)[moved][..., dofs].reshape(-1, len(dofs))
-        missing = (target - skeleton.joints(result)[moved]).ravel()
-        step = np.linalg.solve(J.T @ J + _EXCHANGE_DAMPING * np.eye(len(dofs)), J.T @ missing)
-        result[dofs] = np.clip(result[dofs] + step, skeleton.lower[dofs], skeleton.upper[dofs])
+        jacobian, present = skeleton.joint_jacobian(result), skeleton.joints(result)
+        for one, other in both:
+            dofs, moved = np.concatenate([one.dofs, other.dofs]), one.joints + other.joints
+            J = jacobian[moved][..., dofs].reshape(-1, len(dofs))
+            missing = (joints[other.joints + one.joints] - present[moved]).ravel()
+            step = np.linalg.solve(J.T @ J + _EXCHANGE_DAMPING * np.eye(len(dofs)), J.T @ missing)
+            result[dofs] = np.clip(result[dofs] + step, skeleton.lower[dofs], skeleton.upper[dofs])
     return result
 
 
