@@ -383,9 +383,10 @@ def _launch(
         *(met or (np.empty((1, 1, 1, 1), np.uint8), np.empty((1, 1, 1, 1), np.float32))),
     )
     if before.label.any():
-        column = np.minimum(body.parts[:, PART_GROUP].astype(np.int32) + 1, cost.shape[3] - 1)
+        column = np.minimum(body.parts[:, PART_GROUP].astype(np.intp) + 1, cost.shape[3] - 1)
         columns = np.concatenate([[0], column])[before.label]
-        base = np.take_along_axis(cost, columns[..., None], axis=-1)[..., 0].sum(axis=(1, 2), dtype=np.float64)
+        columns += np.arange(0, cost.size, cost.shape[3]).reshape(columns.shape)  # take is faster than take_along_axis
+        base = cost.ravel().take(columns).sum(axis=(1, 2), dtype=np.float64)
     else:
         base = cost[..., 0].sum(axis=(1, 2), dtype=np.float64)
     return np.asarray(base + change)
