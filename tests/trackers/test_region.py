@@ -474,7 +474,7 @@ def test_landmarks_correct_left_and_right(wrong: str) -> None:
     """Silhouettes alone keep a person who was tracked back to front, or with exchanged legs."""
     pose = POSES[2]
     tracker = tracker_at(pose)
-    mistaken = turned(pose, tracker.limbs) if wrong == "turned" else exchanged(pose, *pairs(tracker.limbs)[1])
+    mistaken = turned(pose, tracker.limbs) if wrong == "turned" else exchanged(pose, pairs(tracker.limbs))[1]
     for landmarks, right in ((None, False), (seen_at(pose), True)):
         tracker.start_at(mistaken)
         found = tracker.step(replace(observe(MASKS[2], 0), landmarks=landmarks))
