@@ -258,7 +258,7 @@ class People:
         counts = [len(person.points) for person in people]
         hulls = [cast_points(rig, grid, person.points, person.voxel_m) for person in people]
         shares: list[list[Observation]] = [[] for _ in people]
-        usual: list[int] = []  # voxels of each hull in the second frame: in the first, all masks carved it
+        at_first: list[int] = []  # voxels of each hull in the second frame: in the first, all masks carved it
         mixed = [False] * len(people)
         for frame in frames:
             owners = assign(rig, grid, hulls, frame, UNKNOWN_BY_HULLS)
@@ -267,9 +267,9 @@ class People:
                     points, places[k] = finder.around(place, owners.share(frame, k).masks, counts[k])
                     if len(points):
                         counts[k], hulls[k] = len(points), cast_points(rig, grid, points, finder.voxel_m)
-                usual = usual or list(counts)
+                at_first = at_first or list(counts)
                 owners = assign(rig, grid, hulls, frame, UNKNOWN_BY_HULLS)
-                for k, (count, first) in enumerate(zip(counts, usual, strict=True)):
+                for k, (count, first) in enumerate(zip(counts, at_first, strict=True)):
                     mixed[k] |= not 1 / _MIXED < count / first < _MIXED
             for k, own in enumerate(shares):
                 if not mixed[k]:

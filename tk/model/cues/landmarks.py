@@ -10,22 +10,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.body.skeleton import JOINTS
+from tk.model.body.joints import JOINTS, LIMBS
 
 Float = NDArray[np.float64]
 
 #: joints of landmarks (..., 12, 3), the left and the right one of each
 LANDMARKS = tuple(
-    f"{joint}_{side}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in "lr"
+    name
+    for kind in ("arm", "leg")
+    for pair in zip(LIMBS[f"{kind}_l"], LIMBS[f"{kind}_r"], strict=True)
+    for name in pair
 )
 #: their places among the joints
 ROWS = np.array([JOINTS.index(name) for name in LANDMARKS])
 
-# Rows of the landmarks of trunk, arms and legs.
-_PARTS = [
-    [row for row, name in enumerate(LANDMARKS) if name[:-2] in part]
-    for part in (("shoulder", "hip"), ("elbow", "wrist"), ("knee", "ankle"))
-]
+# Rows of the landmarks of the trunk, where the limbs begin, of the arms and of the legs.
+_PARTS = ([0, 1, 6, 7], [2, 3, 4, 5], [8, 9, 10, 11])
 # Landmarks belong to a person if their mean is within this distance of the mean of the person's joints, metres: less
 # than half the distance of two people who stand side by side.
 _SAME_M = 0.3
