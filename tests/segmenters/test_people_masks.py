@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tests.model.ring import ring_of_cameras
 from tests.people import VOLUME, person_mask
+from tk.errors import ConfigError
 from tk.model.cameras.volume import Volume
 from tk.model.masks.sightings import Sighting
 from tk.segmenters.people_masks import PeopleMasks
@@ -134,6 +135,15 @@ def test_landmarks_of_everybody_are_triangulated_where_cameras_agree() -> None:
         np.testing.assert_allclose(person[[0, 1]], [(*at, 1.75)] * 2, atol=0.15)
         np.testing.assert_allclose(person[[10, 11]], [(*at, 0.0)] * 2, atol=0.15)
     assert np.isnan(masks_of(OneOfMany()).label(images).landmarks).all()
+
+
+def test_landmarks_of_another_shape_are_refused() -> None:
+    class Wrong(OneOfMany):
+        def segment_pose(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+            return self.segment(image), np.zeros((17, 2))
+
+    with pytest.raises(ConfigError, match=r"segmenter one: returned landmarks \(17, 2\); they must be \(12, 3\)"):
+        masks_of(Wrong()).label(shown([(0.2, 0.1)])[0])
 
 
 def test_masks_do_not_change_the_images() -> None:

@@ -93,7 +93,7 @@ def segmented(
     """Return the checked result of a segmenter for an image: the probabilities, and the landmarks, NaN without any.
 
     Raises:
-        ConfigError: the result is not a probability for each pixel.
+        ConfigError: the result is not a probability for each pixel, or the landmarks are not (12, 3).
     """
     landmarks = np.full((len(LANDMARKS), 3), np.nan)
     if isinstance(segmenter, PoseSegmenter):
@@ -108,5 +108,10 @@ def segmented(
     if not (found.min() >= 0 and found.max() <= 1):  # also fails for NaN
         raise ConfigError(
             f"segmenter {name}: returned values outside 0 to 1; it must return a probability for each pixel"
+        )
+    if np.shape(landmarks) != (len(LANDMARKS), 3):
+        raise ConfigError(
+            f"segmenter {name}: returned landmarks {np.shape(landmarks)}; they must be ({len(LANDMARKS)}, 3): "
+            "x, y and confidence of each joint"
         )
     return found.astype(np.float32, copy=False), landmarks
