@@ -98,7 +98,7 @@ class CameraMonitor:
         shown = [without_cameras(f, b) for f, b in zip(frames, bad, strict=True)]
         agreement = opening_agreement(self._setup, shown)
         if whole and (agreement.refusal or np.count_nonzero(agreement.tested_right) < 2):
-            agreement = opening_agreement(self._setup, whole)
+            agreement = opening_agreement(self._setup, [without_cameras(f, np.asarray(bad.all(axis=0))) for f in whole])
         if agreement.refusal:
             raise CaptureError(agreement.refusal)
         if self._judge is not None:
