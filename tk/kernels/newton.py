@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from tk.kernels.runtime import ti
 
-# Rows of ``priors``.
-LOWER, UPPER, PRECISION, MEAN = range(4)
+# Rows of ``terms``.
+LOWER, UPPER, LINEAR = range(3)
 # Columns of ``numbers``: settings of :class:`tk.optim.gauss_newton.GaussNewtonSettings`, then the steps' lengths.
 DAMPING, STIFFNESS, LIMIT_WEIGHT, LONGEST_STEP, TOLERANCE, LENGTHS = range(6)
 # Keeps the factorisation defined without damping and stiffness, share of the mean diagonal element.
@@ -19,8 +19,10 @@ class NewtonSteps(NamedTuple):
     """What determines the steps of B states with D parameters, besides the equations."""
 
     free: NDArray[np.int32]  # (n,) int32 the parameters that may change
-    # (3 + B, D) limits and precision of the prior, see `LOWER`; from row `MEAN` on the mean of each state's prior
-    priors: NDArray[np.float64]
+    # (2 + B, D) limits, see `LOWER`; from row `LINEAR` on the linear part of each state's quadratic cost
+    terms: NDArray[np.float64]
+    # (B, D, D), or (1, D, D) for all states, its matrix: the cost ½ pᵀ·matrix·p − linear·p is added to the equations
+    matrix: NDArray[np.float64]
     # (5 + S,) see `DAMPING`; the lengths of S steps as multiples of the equations' solution. A step of length 0
     # evaluates the equations only.
     numbers: NDArray[np.float64]
@@ -29,7 +31,8 @@ class NewtonSteps(NamedTuple):
 @ti.func
 def newton_step(
     free: ti.template(),  # (n,)
-    priors: ti.template(),  # (3 + B, D)
+    terms: ti.template(),  # (2 + B, D)
+    matrix: ti.template(),  # (B, D, D) or (1, D, D)
     numbers: ti.template(),  # (5 + S,)
     b: int,
     length,
@@ -51,17 +54,21 @@ def newton_step(
     if unit <= 0.0:
         unit = 1.0 + 0.0 * unit
     pull = numbers[LIMIT_WEIGHT] * unit
+    q = b % matrix.shape[0]
     for i in range(n):
         k = free[i]
         p, element = state[b, k], hessian[b, k, k]
-        excess = ti.min(ti.max(p, priors[LOWER, k]), priors[UPPER, k]) - p
-        element += numbers[DAMPING] * element + (numbers[STIFFNESS] + _LEAST) * unit + priors[PRECISION, k]
+        excess = ti.min(ti.max(p, terms[LOWER, k]), terms[UPPER, k]) - p
+        element += numbers[DAMPING] * element + (numbers[STIFFNESS] + _LEAST) * unit + matrix[q, k, k]
         if excess != 0.0:
             element += pull
         for j in range(i):
-            factor[b, i, j] = hessian[b, k, free[j]]
+            factor[b, i, j] = hessian[b, k, free[j]] + matrix[q, k, free[j]]
         factor[b, i, i] = element
-        factor[b, i, n] = gradient[b, first + k] + pull * excess + priors[PRECISION, k] * (priors[MEAN + b, k] - p)
+        slope = terms[LINEAR + b, k]
+        for j in range(state.shape[1]):
+            slope -= matrix[q, k, j] * state[b, j]
+        factor[b, i, n] = gradient[b, first + k] + pull * excess + slope
     for i in range(n):
         for j in range(i + 1):
             rest = factor[b, i, j]

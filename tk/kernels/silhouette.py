@@ -30,7 +30,7 @@ from tk.kernels.cone_contours import (
 from tk.kernels.cones import point_on, unscaled
 from tk.kernels.kinematics import forward_tree, load_rotation, load_translation
 from tk.kernels.line_search import COLOR_BINS, Regions, SearchSettings, in_picture, search_colors, search_mask
-from tk.kernels.newton import LENGTHS, MEAN, TOLERANCE, NewtonSteps, newton_step
+from tk.kernels.newton import LENGTHS, LINEAR, TOLERANCE, NewtonSteps, newton_step
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.taichi_internals import Launcher
@@ -284,8 +284,9 @@ def _descent_kernel(real):
         likelihood: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (G, COLOR_BINS)
         # settings
         numbers: ti.types.ndarray(dtype=real, ndim=1),  # (11,) from SCALE to EXPORT
-        free: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (n,) this and the next two: :class:`NewtonSteps`
-        priors: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (3 + B, D)
+        free: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (n,) this and the next three: :class:`NewtonSteps`
+        terms: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (2 + B, D)
+        matrix: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (B, D, D) or (1, D, D)
         steps: ti.types.ndarray(dtype=ti.f64, ndim=1),  # (5 + S,)
         spread: ti.i32,
         # the poses
@@ -324,7 +325,7 @@ def _descent_kernel(real):
                 step += 1
                 moves = step < steps.shape[0] - LENGTHS
                 if length > 0.0:
-                    change = newton_step(free, priors, steps, b, length, hessian, sums, GRADIENT, factor, state)
+                    change = newton_step(free, terms, matrix, steps, b, length, hessian, sums, GRADIENT, factor, state)
                     moves = moves and change > steps[TOLERANCE]
             sums[b, STEPS] = step
 
@@ -382,7 +383,8 @@ def _launch(
 @functools.cache
 def _no_steps(parameters: int) -> NewtonSteps:
     """Return the arguments of a launch that evaluates the equations only."""
-    return NewtonSteps(np.zeros(1, np.int32), np.zeros((MEAN + 1, parameters)), np.zeros(LENGTHS + 1))
+    nothing = np.zeros((1, parameters, parameters))
+    return NewtonSteps(np.zeros(1, np.int32), np.zeros((LINEAR + 1, parameters)), nothing, np.zeros(LENGTHS + 1))
 
 
 @functools.lru_cache(64)

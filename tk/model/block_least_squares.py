@@ -58,6 +58,11 @@ class Equations:
         self.hessian[block, index, index] += precision
         self.gradient[block, index] += precision * difference
 
+    def add_normal(self, block: int, columns: NDArray[np.intp], hessian: Float, gradient: Float) -> None:
+        """Add normal equations (K, K), (K,) of some unknowns (K,), indices of D + S, to a block's."""
+        self.hessian[block][np.ix_(columns, columns)] += hessian
+        self.gradient[block, columns] += gradient
+
     def reduced(self, damping: float = 0.0) -> Reduced:
         """Eliminate the blocks. ``damping`` is the share of each diagonal element that is added to it."""
         S = len(self.prior_gradient)

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from tk.errors import ConfigError
 from tk.kernels.newton import NewtonSteps
 from tk.kernels.silhouette import Descent
+from tk.optim.quadratic import Quadratic
 
 Float = NDArray[np.float64]
 
@@ -70,14 +71,6 @@ class GaussNewtonSettings:
         return [self.relaxation] * self.iterations + plain
 
 
-@dataclass(frozen=True)
-class Prior:
-    """A normal prior on the state, in the units of the equations."""
-
-    mean: Float  # (D,) or (B, D)
-    precision: Float  # (D,) zero without a prior
-
-
 class BatchSolution(NamedTuple):
     """Result of :func:`minimise` for B states."""
 
@@ -93,7 +86,7 @@ def minimise(
     lower: Float,
     upper: Float,
     config: GaussNewtonSettings | None = None,
-    prior: Prior | None = None,
+    terms: Callable[[Float], Quadratic] | None = None,
     levels: Sequence[int] | None = None,
 ) -> BatchSolution:
     """Iterate from B states at once; each state's result is independent of the others.
@@ -104,20 +97,22 @@ def minimise(
         free: (n,) indices of the parameters that may change; None: all.
         lower, upper: (D,) limits; infinite without a limit.
         config: see :class:`GaussNewtonSettings`.
-        prior: of the states.
+        terms: further terms of the cost as a quadratic about states (B, D), in the units of the equations; it is
+            called at the start of each scale.
         levels: the scales in order; None: all from the coarsest to the finest.
     """
     config = config or GaussNewtonSettings()
     states = np.array(start, np.float64)
     hessian = np.zeros((*states.shape, states.shape[1]))
-    mean, precision = (0.0, 0.0) if prior is None else (prior.mean, prior.precision)
-    rows = lower, upper, np.broadcast_to(precision, len(lower)), np.broadcast_to(mean, states.shape)
-    priors = np.vstack(rows).astype(np.float64)
     index = np.arange(len(lower), dtype=np.int32) if free is None else free.astype(np.int32)
     scales = range(config.scales - 1, -1, -1) if levels is None else levels
     iterations = np.zeros(len(scales), np.int32)
+    none = Quadratic(np.zeros((1, len(lower))), np.zeros((1, len(lower), len(lower))))
     for i, scale in enumerate(scales):
-        states, hessian, made = descend(states, scale, NewtonSteps(index, priors, _numbers(config, scale == 0)))
+        linear, matrix = none if terms is None else terms(states)
+        rows = np.vstack([lower, upper, np.broadcast_to(linear, states.shape)])
+        steps = NewtonSteps(index, rows, matrix, _numbers(config, scale == 0))
+        states, hessian, made = descend(states, scale, steps)
         iterations[i] = made.max(initial=0)
     return BatchSolution(states, hessian, iterations)
 

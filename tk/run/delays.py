@@ -74,3 +74,19 @@ def retimed(store: MaskStore, frames: NDArray[np.int64], late: NDArray[np.int64]
         ]
         result.put(frame, np.stack(layers))
     return result
+
+
+def retimed_landmarks(
+    landmarks: NDArray[np.float64] | None, frames: NDArray[np.int64], late: NDArray[np.int64]
+) -> NDArray[np.float64] | None:
+    """Return the landmarks (F, C, L, 3) of frames (F,) of cameras that are late by whole frames (C,); NaN if a camera
+    has no image."""
+    if landmarks is None or not late.any():
+        return landmarks
+    result = np.full(landmarks.shape, np.nan)
+    row = {frame: i for i, frame in enumerate(frames.tolist())}
+    for c, n in enumerate(late.tolist()):
+        for i, frame in enumerate(frames.tolist()):
+            if frame - n in row:
+                result[i, c] = landmarks[row[frame - n], c]
+    return result

@@ -242,7 +242,11 @@ class Loop:
                 self.masks[number].put(observation.index, self._kept(answer))
             # masks are large, and a view into the ring of frames: an estimate must not keep them
             whole = replace(estimate, frame=observation.index, time=observation.time, person=number)
-            present.append(replace(whole, masks=None, drawn=None, mask_source=observation.sources))
+            whole = replace(whole, masks=None, drawn=None, mask_source=observation.sources)
+            if whole.landmarks is not None:
+                seen = self.plan.task.setup.rig.recorded_pixels(whole.landmarks).astype(np.float32)
+                whole = replace(whole, landmarks=seen)
+            present.append(whole)
         return tuple(present)
 
     def _kept(self, answer: Tracked) -> NDArray[np.uint8]:
@@ -293,6 +297,7 @@ def _row(estimate: Estimate, store_hull: bool) -> dict[str, ArrayLike]:
         "joints/sigma": estimate.sigma,
         "residual": estimate.residual,
         "mask_source": estimate.mask_source,
+        "landmarks": estimate.landmarks,
         "status": int(Status[estimate.status.upper()]),
         "objective": estimate.objective,
         "iterations": estimate.iterations,

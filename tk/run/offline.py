@@ -24,7 +24,7 @@ from tk.model.cameras.common_view import determine_depth
 from tk.model.masks.image_health import described
 from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
-from tk.run.delays import retimed
+from tk.run.delays import retimed, retimed_landmarks
 from tk.run.identity import COLUMNS, EXCHANGED, UNCLEAR, doubtful, exchange_masks, exchanged, report
 from tk.run.member import Member
 from tk.run.people import People
@@ -99,7 +99,8 @@ def finish(
         result = results[number]
         draft = _Draft(result, ~result.has_pose, result.has_pose & doubtful(result, contacts))
         if result is not found[number]:
-            draft.columns = {dataset: getattr(result, name) for dataset, name in COLUMNS.items()}
+            columns = {dataset: getattr(result, name) for dataset, name in COLUMNS.items()}
+            draft.columns = {dataset: values for dataset, values in columns.items() if values is not None}
         finisher.finish(member, draft, None if masks is None else masks[number])
 
 
@@ -210,6 +211,7 @@ class _Finisher:
             draft.lost,
             draft.current("residual"),
             subject.height_m,
+            self._landmarks(draft),
             # in the initialisation pose every limb is visible; other first poses may hide limbs, and so may others
             keep_body=subject.body is not None
             or (self.alone and subject.init is None and subject.in_init_pose and not turned),
@@ -247,7 +249,8 @@ class _Finisher:
         residual = []
         for hypothesis, one in zip(hypotheses, drafts, strict=True):
             first = one.current("pose"), one.lost, one.current("residual")
-            residual.append(hypothesis.second_pass(seen, *first, height_m, True, self.within)[1].sum(axis=-1))
+            again = hypothesis.second_pass(seen, *first, height_m, self._landmarks(draft), True, self.within)
+            residual.append(again[1].sum(axis=-1))
         both = ~(drafts[0].lost | drafts[1].lost)
         if not np.nanmean(residual[1][both]) < np.nanmean(residual[0][both]):
             return tracker
@@ -290,8 +293,7 @@ class _Finisher:
             self.note(f"{apart}: all frames are suspect")
             draft.unclear = ~draft.lost
         if member.number:
-            late = np.round((self.cameras.time_offset_s - task.source.time_offset_s) * task.setup.fps).astype(np.int64)
-            return tracker.with_cameras(self.cameras.rig), retimed(masks, result.frames, late)
+            return tracker.with_cameras(self.cameras.rig), retimed(masks, result.frames, self._late)
         if agreement is None or apart or not task.settings.refine:
             return tracker, masks
         refined = refine_if_inconsistent(tracker, agreement, compared, tracked, self.note)
@@ -304,6 +306,19 @@ class _Finisher:
             self.note("tracking again: the images of the first pass were not synchronised")
             self._track_again(tracker, masks, draft)
         return tracker, masks
+
+    @property
+    def _late(self) -> NDArray[np.int64]:
+        """(C,) whole frames by which each video is late, as found."""
+        found = self.cameras.time_offset_s - self.task.source.time_offset_s
+        return np.round(found * self.task.setup.fps).astype(np.int64)
+
+    def _landmarks(self, draft: _Draft) -> NDArray[np.float64] | None:
+        """Return the landmarks (F, C, L, 3) of a draft, synchronised, in pixels of the cameras in use; None without."""
+        found = draft.current("landmarks")
+        if found is None:
+            return None
+        return retimed_landmarks(self.task.setup.rig.reduced_pixels(found), draft.result.frames, self._late)
 
     def _track_again(self, tracker: TwoPassTracker, masks: MaskStore, draft: _Draft) -> None:
         """Track the frames again of which every synchronised camera has an image, beginning at the first pass's pose;

@@ -20,6 +20,7 @@ from tk.io.settings_file import to_toml
 from tk.model.body.angles import ANGLES
 from tk.model.body.anthropometry import AVERAGE_BODY
 from tk.model.body.skeleton import SEGMENTS, build_skeleton
+from tk.model.cues.landmarks import LANDMARKS
 from tk.model.setup import Setup, Subject
 from tk.run.prefetch import TIMING_STAGES, Observations, open_observations
 from tk.run.segmentation import mask_source, sources_of_masks
@@ -155,6 +156,7 @@ class Plan:
             sigma=tracker.reports_sigma,
             residual_cameras=setup.rig.names if tracker.reports_sigma else (),
             mask_sources=sources_of_masks(task.source) if tracker.reports_sigma else (),
+            landmark_names=LANDMARKS if tracker.reports_sigma and sources_of_masks(task.source) else (),
             segment_names=SEGMENTS if tracker.has_segments else (),
             feet=tracker.has_segments,
             angles=tuple(JointAngles(a.joint, a.names, a.convention) for a in ANGLES) if tracker.has_segments else (),

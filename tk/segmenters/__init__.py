@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
-from tk.model.cues.landmarks import LANDMARKS
+from tk.model.cues.landmarks import JOINT_LANDMARKS, LANDMARKS
 
 if TYPE_CHECKING:
     from tk.model.masks.sightings import Sighting
@@ -49,12 +49,15 @@ class Finder(Protocol):
 
 @runtime_checkable
 class PoseSegmenter(Protocol):
-    """A segmenter that also sees where the person's joints are."""
+    """A segmenter that also sees where points of the person's body are.
+
+    Its attribute ``landmarks`` names them, see :data:`tk.model.cues.landmarks.LANDMARKS`; without it, they are
+    :data:`tk.model.cues.landmarks.JOINT_LANDMARKS`.
+    """
 
     def segment_pose(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """Return the probability (h, w) of :meth:`Segmenter.segment`, and the landmarks (12, 3) of the same person, in
-        the order of :data:`tk.model.cues.landmarks.LANDMARKS`: x, y, pixels of the image (h, w, 3), and confidence, 0
-        to 1; NaN if there is nobody.
+        """Return the probability (h, w) of :meth:`Segmenter.segment`, and the landmarks (L, 3) of the same person: x,
+        y, pixels of the image (h, w, 3), and visibility, 0 to 1; NaN if there is nobody.
         """
         ...
 
@@ -90,14 +93,24 @@ def load(name: str) -> Segmenter:
 def segmented(
     segmenter: Segmenter, name: str, image: NDArray[np.uint8]
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Return the checked result of a segmenter for an image: the probabilities, and the landmarks, NaN without any.
+    """Return the checked result of a segmenter for an image: the probabilities (h, w), and the landmarks (L, 3) in the
+    order of :data:`~tk.model.cues.landmarks.LANDMARKS`, NaN where the segmenter has none.
 
     Raises:
-        ConfigError: the result is not a probability for each pixel, or the landmarks are not (12, 3).
+        ConfigError: the result is not a probability for each pixel, or not one row of three numbers for each landmark.
     """
     landmarks = np.full((len(LANDMARKS), 3), np.nan)
     if isinstance(segmenter, PoseSegmenter):
-        found, landmarks = segmenter.segment_pose(image)
+        names = getattr(segmenter, "landmarks", JOINT_LANDMARKS)
+        found, seen = segmenter.segment_pose(image)
+        if np.shape(seen) != (len(names), 3):
+            raise ConfigError(
+                f"segmenter {name}: returned landmarks {np.shape(seen)}; they must be ({len(names)}, 3): x, y and "
+                "visibility of each landmark"
+            )
+        for each, row in zip(names, seen, strict=True):
+            if each in LANDMARKS:
+                landmarks[LANDMARKS.index(each)] = row
     else:
         found = np.asarray(segmenter.segment(image))
     if found.shape != image.shape[:2] or found.dtype.kind != "f":
@@ -108,10 +121,5 @@ def segmented(
     if not (found.min() >= 0 and found.max() <= 1):  # also fails for NaN
         raise ConfigError(
             f"segmenter {name}: returned values outside 0 to 1; it must return a probability for each pixel"
-        )
-    if np.shape(landmarks) != (len(LANDMARKS), 3):
-        raise ConfigError(
-            f"segmenter {name}: returned landmarks {np.shape(landmarks)}; they must be ({len(LANDMARKS)}, 3): "
-            "x, y and confidence of each joint"
         )
     return found.astype(np.float32, copy=False), landmarks

@@ -31,11 +31,15 @@ _THREADS = 2
 _GRIDS = ((28, 2), (14, 2), (7, 6))
 _HIPS, _CIRCLE = slice(4, 6), slice(6, 8)  # columns: mid-hip point, point on the circle around the body
 _LEAST_SCORE = 0.5  # MediaPipe's value
-# The pose network's points, each with x, y, z, visibility, presence (MediaPipe's tensors_to_pose_landmarks); and those
-# of LANDMARKS among them: shoulders, elbows, wrists, hips, knees, ankles.
+# The pose network's points, each with x, y, z, visibility, presence (MediaPipe's tensors_to_pose_landmarks).
 _POINTS, _COLUMNS = 39, 5
 _VISIBLE = 3  # column, a logit
-_USED = [11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28]
+# Rows of the network's points that correspond to a point of the body; the eyes are their centres.
+_ROWS = {
+    "nose": 0, "eye_l": 2, "eye_r": 5, "ear_l": 7, "ear_r": 8, "shoulder_l": 11, "shoulder_r": 12, "elbow_l": 13,
+    "elbow_r": 14, "wrist_l": 15, "wrist_r": 16, "hip_l": 23, "hip_r": 24, "knee_l": 25, "knee_r": 26, "ankle_l": 27,
+    "ankle_r": 28, "heel_l": 29, "heel_r": 30, "toe_l": 31, "toe_r": 32,
+}  # fmt: skip
 # Detections whose mid-hip points differ by less than this share of the radius are one person. Detections of one person
 # differ by far less, different people by more. Half and twice the value change the mean errors of walk and pair without
 # an empty scene (55 frames) by 0.01 cm.
@@ -43,11 +47,16 @@ _SAME = 0.5
 
 
 class BlazePose:
-    """A :class:`~tk.segmenters.Segmenter` and :class:`~tk.segmenters.Finder`.
+    """A :class:`~tk.segmenters.PoseSegmenter` and :class:`~tk.segmenters.Finder`.
+
+    Attributes:
+        landmarks: names of the landmarks that :meth:`segment_pose` returns.
 
     Raises:
         ConfigError: the weights are missing and cannot be downloaded.
     """
+
+    landmarks = tuple(_ROWS)
 
     def __init__(self) -> None:
         files = weights()
@@ -89,7 +98,7 @@ class BlazePose:
         found = self._pose(square / np.float32(255))
         (logits,) = (a for a in found if a.shape[1:3] == (_POSE_SIDE,) * 2)
         (rows,) = (a.reshape(-1, _COLUMNS) for a in found if a.size == _POINTS * _COLUMNS)
-        used = rows[_USED].astype(np.float64)
+        used = rows[list(_ROWS.values())].astype(np.float64)
         landmarks = np.column_stack([(used[:, :2] + 0.5) / scale - 0.5, _probability(used[:, _VISIBLE])])
         (present,) = (float(a.item()) for a in found if a.size == 1)
         if not present >= _LEAST_SCORE:

@@ -31,7 +31,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.model.cameras.camera import Rig
-from tk.model.cameras.triangulation import triangulate_joints
 from tk.model.cameras.volume import Volume
 from tk.model.cues.landmarks import LANDMARKS
 from tk.model.hull.coarse import CoarseHull
@@ -71,7 +70,7 @@ class _Person:
     Attributes:
         patches: one per camera.
         masks, uncertain: (C, H, W) uint8, 0 or 255, and bool.
-        landmarks: (C, 12, 3) x, y, pixels, and confidence; NaN where there are none.
+        landmarks: (C, L, 3) x, y, pixels, and visibility; NaN where there are none.
         round: round of the search in which the person was found; those of earlier ones were painted over.
     """
 
@@ -88,8 +87,8 @@ class Segmented(NamedTuple):
     Attributes:
         masks: (C, H, W) uint8, 0 or 255.
         uncertain: (C, H, W) bool, where the mask is 0.
-        landmarks: (N, 12, 3) m, of each person, see :data:`~tk.model.cues.landmarks.LANDMARKS`; NaN where no two
-            cameras agree.
+        landmarks: (N, C, L, 3) x, y, pixels, and visibility of each of N people's landmarks in each image, see
+            :data:`~tk.model.cues.landmarks.LANDMARKS`; NaN where an image shows none.
     """
 
     masks: Images
@@ -121,8 +120,8 @@ class PeopleMasks:
         for person in people:
             masks |= person.masks
             uncertain |= person.uncertain
-        landmarks = np.array([triangulate_joints(self._rig, person.landmarks)[0] for person in people])
-        return Segmented(masks, uncertain & (masks == 0), landmarks.reshape(-1, len(LANDMARKS), 3))
+        landmarks = np.array([person.landmarks for person in people])
+        return Segmented(masks, uncertain & (masks == 0), landmarks.reshape(-1, len(images), len(LANDMARKS), 3))
 
     def without_specks(self, masks: Images) -> Images:
         """Return masks (C, H, W) without small parts that no other camera shows: shadows, reflections."""
@@ -257,7 +256,7 @@ class PeopleMasks:
 
     def _seen(self, image: Images, c: int, patch: Patch) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
         """Return the probability (H, W) of each pixel to show the person in the middle of a square, 0 outside it; and
-        the person's landmarks (12, 3) in the image."""
+        the person's landmarks (L, 3) in the image."""
         whole = np.zeros(image.shape[:2], np.float32)
         picture = self._shown(image, c)
         found, landmarks = segmented(self._segmenter, self._name, patch.cut(picture))

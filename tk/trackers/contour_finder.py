@@ -5,7 +5,7 @@ masks → cleaned, scales → {contours → edgels along their normals → norma
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -24,15 +24,18 @@ from tk.model.body.initial_pose import rough_pose
 from tk.model.body.limb_candidates import Limb, limbs_of
 from tk.model.body.skeleton import build_skeleton, convert_poses
 from tk.model.body.stored_body import body_values
+from tk.model.cameras.bundle import CORRELATION_PX
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import spread_out
 from tk.model.cameras.tracker_frame import TrackerFrame
+from tk.model.cues.landmarks import WEIGHT, LandmarkCue, of_person
 from tk.model.cues.part_colors import PartColors
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Pyramid, Views
 from tk.model.setup import Subject
 from tk.optim import gauss_newton
-from tk.optim.gauss_newton import BatchSolution, GaussNewtonSettings, Prior
+from tk.optim.gauss_newton import BatchSolution, GaussNewtonSettings
+from tk.optim.quadratic import Quadratic
 from tk.settings import SilhouetteSettings
 from tk.trackers.initialisation import TrajectoryHypothesis, centroid, find_person, stature_of
 from tk.trackers.limb_search import LimbSearch
@@ -46,9 +49,8 @@ ESTIMATED_STATURE_DEVIATION = 0.05
 # heights the factor is 0.955 to 1.077 on nine recordings; children's proportions and wide clothes need more. A visual
 # hull that is lower by more than this shows a person who bends, so its height is no estimate of the stature.
 MOST_STATURE_RATIO = 1.35
-# Decrease of the cost, as a share of the person's pixels, at which another pose of a limb replaces the current one.
-# Between half and twice the value, the mean errors of dance and cube (60 frames) change by 0.01 cm at most.
-GAIN = 0.004
+# Information of one pixel of contour, 1/px²: edgels err by 2 px. The unit of the contours' equations.
+INFORMATION = 1.0 / (2.0**2 * CORRELATION_PX)
 # Cameras that the search at the start uses, at most. More cost time and hardly add a direction: with 8 of the 16
 # cameras of sixteen the mean error of the joints changes by less than 0.1 cm. The body is fitted with all of them.
 OPENING_CAMERAS = 8
@@ -205,8 +207,8 @@ class ContourFinder:
     ) -> Float:
         """Fit the body to the opening and return the pose (D,) in its first frame.
 
-        Of several hypotheses the one is chosen that has the lowest product of two residuals: that of the average body
-        and that of the body fitted to it, because a fitted body compensates a part of a wrong trajectory.
+        Of several hypotheses the one is chosen that has the lowest sum of two costs: that with the average body and
+        that with the body fitted to it, because a fitted body compensates a part of a wrong trajectory.
 
         Args:
             frames, pyramids: the F frames of the opening, and their silhouettes.
@@ -222,16 +224,16 @@ class ContourFinder:
             cost = hypothesis.cost
             if len(hypotheses) > 1:
                 self.take_body(body)
-                residuals = np.array(list(map(self._converged_residual, frames, pyramids, hypothesis.poses)))
-                cost *= float(residuals[np.isfinite(residuals)].mean())  # infinite in frames without a person
+                costs = np.array(list(map(self._converged_score, frames, pyramids, hypothesis.poses)))
+                cost += float(costs[np.isfinite(costs)].mean())  # infinite in frames without a person
             found.append((cost, body, fitted[0]))
         _, body, pose = min(found, key=lambda one: one[0])
         self.take_body(body)
         return np.asarray(pose)
 
-    def _converged_residual(self, frame: Observation, pyramid: Pyramid, pose: Float) -> float:
-        """Return E_S of the pose that a pose (D,) converges to; uncertain pixels count half."""
-        return float(self.mean_residual(pyramid, self.settle(pyramid, pose[None]).states, frame.uncertain)[0])
+    def _converged_score(self, frame: Observation, pyramid: Pyramid, pose: Float) -> float:
+        """Return the cost of the pose that a pose (D,) converges to, nats; uncertain pixels count half."""
+        return float(self.score(pyramid, self.settle(pyramid, pose[None]).states, frame.uncertain)[0])
 
     def fit(
         self,
@@ -248,8 +250,13 @@ class ContourFinder:
     # --- one frame ----------------------------------------------------------------------------------------------
 
     def pyramid(self, frame: Observation) -> Pyramid:
-        """Return the frame's silhouettes, cleaned, at all scales."""
-        return self.views.pyramid(frame.masks, self.solver.scales, True)
+        """Return the frame's silhouettes, cleaned, at all scales, and the person's landmarks."""
+        pyramid = self.views.pyramid(frame.masks, self.solver.scales, True)
+        return replace(pyramid, landmarks=of_person(frame.landmarks, pyramid.masks[0]))
+
+    def landmarks(self, pyramid: Pyramid) -> LandmarkCue | None:
+        """Return the landmarks of the person in a frame as a cue, if there are any."""
+        return None if pyramid.landmarks is None else LandmarkCue(self.views.rig, self.body, pyramid.landmarks)
 
     def settle(
         self,
@@ -257,7 +264,7 @@ class ContourFinder:
         poses: Float,
         levels: Sequence[int] | None = None,
         images: NDArray[np.uint8] | None = None,
-        prior: Prior | None = None,
+        prior: Quadratic | None = None,
         limb: Limb | None = None,
         solver: GaussNewtonSettings | None = None,
     ) -> BatchSolution:
@@ -268,7 +275,7 @@ class ContourFinder:
             poses: (B, D).
             levels: scales, 0 the finest; None: all.
             images: with images, colour differences attract contours inside the silhouette, too.
-            prior: see :class:`~tk.optim.gauss_newton.Prior`.
+            prior: of the poses, in the units of the contours' equations, see :data:`INFORMATION`.
             limb: only this limb moves.
             solver: iterations at each scale; None: :attr:`solver`.
         """
@@ -284,13 +291,31 @@ class ContourFinder:
             body.skeleton.lower,
             body.skeleton.upper,
             solver or self.solver,
-            prior,
+            self.terms(pyramid, prior),
             levels,
         )
 
+    def terms(self, pyramid: Pyramid, prior: Quadratic | None = None) -> Callable[[Float], Quadratic] | None:
+        """Return the terms of the cost beside the contours, about poses (B, D); None if there are none."""
+        landmarks = self.landmarks(pyramid)
+        if landmarks is None:
+            return None if prior is None else lambda _: prior
+
+        def both(poses: Float) -> Quadratic:
+            seen = landmarks.normal(poses).scaled(WEIGHT / INFORMATION)
+            return seen if prior is None else seen + prior
+
+        return both
+
     def evidence(self, grid: RayGrid, frame: Observation, pyramid: Pyramid) -> Evidence:
-        """Return the costs of a frame on a grid of rays."""
-        return Evidence.of(grid, pyramid.masks[0], frame.uncertain, frame.images, self.colors)
+        """Return the costs of a frame on a grid of rays, and by its landmarks."""
+        landmarks = self.landmarks(pyramid)
+        return Evidence.of(grid, pyramid.masks[0], frame.uncertain, frame.images, self.colors, landmarks)
+
+    def score(self, pyramid: Pyramid, poses: Float, uncertain: NDArray[np.bool_] | None = None) -> Float:
+        """Return (B,) the negative logarithm of the likelihood of a frame without colours, nats."""
+        evidence = Evidence.of(self.screen, pyramid.masks[0], uncertain, landmarks=self.landmarks(pyramid))
+        return evidence.score(self.body, poses)
 
     def mean_residual(self, pyramid: Pyramid, poses: Float, uncertain: NDArray[np.bool_] | None = None) -> Float:
         """Return (B,) E_S, mean over the views that see anybody, inf if none does. A body on ``uncertain`` pixels
@@ -305,7 +330,8 @@ class ContourFinder:
         evidence: Evidence,
         pose: Float,
         images: NDArray[np.uint8] | None = None,
-        misplaced: Sequence[Limb] = (),
+        misplaced: Sequence[Limb] | None = (),
+        further: Float | None = None,
     ) -> tuple[Float, Float]:
         """Search for better poses of the limbs, see :mod:`tk.trackers.limb_search`, and settle the best of them.
 
@@ -313,28 +339,31 @@ class ContourFinder:
             frame, pyramid, evidence: the frame, its silhouettes, its costs on the grid :attr:`screen`.
             pose: (D,) current pose.
             images: as in :meth:`settle`.
-            misplaced: limbs that are known to be misplaced.
+            misplaced: limbs that are known to be misplaced; None: limbs are not searched for.
+            further: (B, D) other poses that are settled and compared.
 
         Returns:
-            Poses (B, D), the current one first, and their costs (B,).
+            Poses (B, D), the current one first, and their costs (B,), nats.
         """
 
         def settle(poses: Float, levels: Sequence[int], limb: Limb | None) -> Float:
             return self.settle(pyramid, poses, levels, images, limb=limb).states
 
-        search = LimbSearch(self.body, self.limbs, evidence, settle, pose)
-        rng = np.random.default_rng([7, frame.index])
-        best = search.better(min(1, self.solver.scales - 1), misplaced, rng)
-        if not len(best):
-            return pose[None], np.array([search.own])
-        settled = np.concatenate([pose[None], settle(best, (0,), None)])
-        return settled, self.evidence(self.choice, frame, pyramid).costs(self.body, settled)
+        found = pose[None]
+        if misplaced is not None:
+            search = LimbSearch(self.body, self.limbs, evidence, settle, pose)
+            rng = np.random.default_rng([7, frame.index])
+            best = search.better(min(1, self.solver.scales - 1), misplaced, rng)
+            if len(best):
+                found = np.concatenate([found, settle(best, (0,), None)])
+        if further is not None and len(further):
+            found = np.concatenate([found, self.settle(pyramid, further, None, images).states])
+        return found, self.evidence(self.choice, frame, pyramid).score(self.body, found)
 
     def improved(self, frame: Observation, pyramid: Pyramid, pose: Float) -> Float:
-        """Return the pose (D,), or the best one of a limb search if that costs :data:`GAIN` less."""
+        """Return the pose (D,), or the best one of a limb search if that costs less."""
         poses, cost = self.search(frame, pyramid, self.evidence(self.screen, frame, pyramid), pose)
-        best = int(np.argmin(cost))
-        return np.asarray(poses[best if cost[best] < cost[0] - GAIN else 0])
+        return np.asarray(poses[int(np.argmin(cost))])
 
     def model(self) -> Mapping[str, Any]:
         """Return the body as stored in `/model`."""

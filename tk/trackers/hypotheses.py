@@ -8,14 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.model.body.skeleton import Skeleton
-from tk.trackers.contour_finder import GAIN
 
 Float = NDArray[np.float64]
 
 # Frames during which a hypothesis is tracked beside the best one, and the share of its running cost that a frame
-# replaces. A hypothesis that costs MARGIN more than the best one, as a share of the person's pixels, is dropped. Half
-# and twice of each change the mean errors of dance and cube (50 frames) by less than 0.1 cm.
-PATIENCE, RENEWAL, MARGIN = 6, 0.4, 0.02
+# replaces. A hypothesis is dropped if its probability is e^-DROPPED of the best one's. Half and twice of each change
+# the mean errors of dance and cube (50 frames) by less than 0.1 cm.
+PATIENCE, RENEWAL, DROPPED = 6, 0.4, 5.0
 
 
 @dataclass(frozen=True)
@@ -24,7 +23,7 @@ class Hypothesis:
 
     Attributes:
         pose, previous: (D,) in this frame and the one before.
-        cost: running mean of its cost.
+        cost: running mean of its cost, nats.
         age: frames since it was proposed.
         jumped: whether a limb search has just found it. ``previous`` is then that of the pose it replaces, so that the
             two may differ by a fast motion or by a jump.
@@ -38,8 +37,8 @@ class Hypothesis:
 
 
 def disagreement(skeleton: Skeleton, poses: Float, cost: Float) -> Float:
-    """Return (J,) variance of the joints' positions along an axis, metres², over poses (H, D) with costs (H,)."""
-    weight = np.exp((cost.min() - cost) / GAIN)
+    """Return (J,) variance of the joints' positions along an axis, metres², over poses (H, D) with costs (H,), nats."""
+    weight = np.exp(cost.min() - cost)
     weight /= weight.sum()
     joints = skeleton.joints(poses)
     mean = np.einsum("h,hja->ja", weight, joints)

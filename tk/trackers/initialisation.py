@@ -24,6 +24,7 @@ from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.initial_pose import GREATEST_STATURE, LEAST_STATURE
 from tk.model.body.skeleton import Skeleton
 from tk.model.cameras.camera import Rig
+from tk.model.cues.landmarks import propose
 from tk.model.cues.ray_costs import Evidence
 from tk.model.masks.silhouettes import Pyramid
 from tk.model.setup import AVERAGE_STATURE_M
@@ -50,14 +51,13 @@ FINALISTS, OPPOSITE = 4, 2
 # the development captures an average body of the right stature has 0.15 to 0.31 in the right pose and never less than
 # 0.25 in a wrong one.
 ANCHORS, CLEAR = 4, 0.2
-# Factors by which a residual must exceed another one to be certainly worse. They are no excess over a baseline: before
-# the start there is no baseline, and the residual of an average body varies by a factor of two between captures (see
-# CLEAR). Over the whole opening, hypotheses within AMBIGUOUS are all kept. A hypothesis that faces the same way as the
-# best one in its frame must be better by HANDICAP, because legs that change places explain a walk equally well but for
-# noise. In a single frame the opposite heading is kept within NEARLY, and a frame above WORSE times the anchor's
-# residual triggers a limb search. Chosen on the development captures. With five cameras, a tenth less (AMBIGUOUS is at
-# least 1) and a fifth more of each change no mean error of dance, cube and fold (40 frames).
-AMBIGUOUS, HANDICAP, NEARLY, WORSE = 1.1, 1.1, 1.4, 1.2
+# Costs are negative logarithms of a posterior, nats. An average body errs in all frames alike, so the opening counts as
+# much as one frame. Hypotheses are kept while their probability is above e^-OPEN of the best one's. Legs that change
+# places explain a walk equally well but for noise: the prior of a hypothesis that faces the same way as the best one in
+# its frame is e^-EXCHANGE. In a single frame a pose that faces the other way is kept within OPPOSITE_OPEN.
+OPEN, EXCHANGE, OPPOSITE_OPEN = 7.0, 6.0, 24.0
+# A frame in which the residual is higher than the anchor's by this factor triggers a limb search.
+WORSE = 1.2
 # A pose with a higher residual explains nothing: twice what an average body of the right stature leaves. Without a
 # better one in any of the frames the person is not found.
 UNEXPLAINED = 0.6
@@ -76,25 +76,18 @@ class TrajectoryHypothesis(NamedTuple):
 
     Attributes:
         poses: (F, D).
-        residual: their mean E_S.
-        handicap: factor on the residual when hypotheses are compared.
+        cost: negative logarithm of their posterior, mean over the frames, nats.
     """
 
     poses: Float
-    residual: float
-    handicap: float = 1.0
-
-    @property
-    def cost(self) -> float:
-        """The residual times the handicap."""
-        return self.residual * self.handicap
+    cost: float
 
 
 def find_person(
     finder: ContourFinder, frames: Sequence[Observation], pyramids: Sequence[Pyramid], pose: Float | None = None
 ) -> list[TrajectoryHypothesis]:
-    """Return trajectory hypotheses over F consecutive frames, best first. Those after the first are within AMBIGUOUS of
-    it; the caller fits a body to each of them to decide.
+    """Return trajectory hypotheses over F consecutive frames, best first. Those after the first are nearly as probable;
+    the caller fits a body to each of them to decide.
 
     Args:
         finder: with an average body.
@@ -109,8 +102,8 @@ def find_person(
         return _follow(finder, frames, pyramids, [_searched(finder, frames[0], pyramids[0], pose)], 0)
     skeleton = finder.body.skeleton
     hypotheses: list[TrajectoryHypothesis] = []
-    alternatives: list[tuple[int, int, Float, float]] = []  # rank in its anchor, anchor, pose, handicap
-    clear: list[tuple[int, Float, float]] = []  # anchor, pose, handicap
+    alternatives: list[tuple[int, int, Float, float]] = []  # rank in its anchor, anchor, pose, prior in nats
+    clear: list[tuple[int, Float, float]] = []  # anchor, pose, prior
     least = np.inf
     for anchor in np.unique(np.linspace(0, len(frames) - 1, ANCHORS).astype(int)):
         try:
@@ -124,11 +117,11 @@ def find_person(
             continue
         for rank, pose in enumerate(poses[1:]):
             turned = _turned(skeleton, pose[None], poses[0])[0]
-            alternatives.append((rank, int(anchor), pose, 1.0 if turned else HANDICAP))
+            alternatives.append((rank, int(anchor), pose, 0.0 if turned else EXCHANGE))
         if _contains(skeleton, hypotheses, anchor, poses[0]):
             break  # found from two frames
         if residual < CLEAR and not hypotheses:
-            clear = [(int(anchor), poses[0], 1.0)]  # followed with its alternatives: no other anchor is needed
+            clear = [(int(anchor), poses[0], 0.0)]  # followed with its alternatives: no other anchor is needed
             break
         hypotheses += _follow(finder, frames, pyramids, poses[:1], anchor)
         if residual < CLEAR:
@@ -140,16 +133,15 @@ def find_person(
         )
     likeliest = sorted(range(len(alternatives)), key=lambda i: alternatives[i][0])[:FOLLOWED]
     for anchor, group in groupby([*clear, *(alternatives[i][1:] for i in sorted(likeliest))], itemgetter(0)):
-        new = [(pose, handicap) for _, pose, handicap in group if not _contains(skeleton, hypotheses, anchor, pose)]
+        new = [(pose, prior) for _, pose, prior in group if not _contains(skeleton, hypotheses, anchor, pose)]
         followed = _follow(finder, frames, pyramids, [pose for pose, _ in new], anchor)
-        hypotheses += [one._replace(handicap=handicap) for one, (_, handicap) in zip(followed, new, strict=True)]
+        hypotheses += [one._replace(cost=one.cost + prior) for one, (_, prior) in zip(followed, new, strict=True)]
     hypotheses.sort(key=lambda hypothesis: hypothesis.cost)
-    least = min(hypothesis.residual for hypothesis in hypotheses)
     kept: list[TrajectoryHypothesis] = []
     for hypothesis in hypotheses:
         joints = skeleton.joints(hypothesis.poses)
         apart = [np.max(skeleton.apart(other.poses, joints)) for other in kept]
-        if hypothesis.residual <= AMBIGUOUS * least and all(distance > SAME_START_M for distance in apart):
+        if hypothesis.cost <= hypotheses[0].cost + OPEN and all(distance > SAME_START_M for distance in apart):
             kept.append(hypothesis)
     return kept
 
@@ -161,8 +153,8 @@ def _contains(skeleton: Skeleton, hypotheses: Sequence[TrajectoryHypothesis], fr
 
 
 def _find(finder: ContourFinder, frame: Observation, pyramid: Pyramid) -> tuple[float, list[Float]]:
-    """Return the lowest residual (E_S) in a frame, and poses (D,): the one that has it, then one that faces the other
-    way and those that few cameras cannot distinguish from it."""
+    """Return the residual (E_S) of the best pose in a frame, and poses (D,): the best one, then one that faces the
+    other way and those that few cameras cannot distinguish from it."""
     skeleton = finder.body.skeleton
     p_centroid = centroid(finder.views.rig, pyramid, frame.index)
     levels = range(finder.solver.scales - 1, -1, -1)
@@ -170,22 +162,25 @@ def _find(finder: ContourFinder, frame: Observation, pyramid: Pyramid) -> tuple[
     def ordered(poses: Float, levels: Sequence[int]) -> tuple[Float, NDArray[np.bool_]]:
         """Return the poses that these converge to, best first, and whether they face another way than the best."""
         settled = finder.settle(pyramid, poses, levels).states
-        order = settled[np.argsort(finder.mean_residual(pyramid, settled, frame.uncertain), kind="stable")]
+        order = settled[np.argsort(finder.score(pyramid, settled, frame.uncertain), kind="stable")]
         return order, _turned(skeleton, order, order[0])
 
-    coarse, turned = ordered(gait.hypotheses(skeleton, HEADINGS, PHASES, p_centroid), levels[:1])
+    starts = gait.hypotheses(skeleton, HEADINGS, PHASES, p_centroid)
+    if pyramid.landmarks is not None:
+        starts = np.concatenate([starts, propose(finder.views.rig, skeleton, pyramid.landmarks)])
+    coarse, turned = ordered(starts, levels[:1])
     kept = [poses[: -(-len(poses) // REFINED)] for poses in (coarse[~turned], coarse[turned])]
     order, turned = ordered(np.concatenate(kept), levels[1:])
     finalists = np.array(_distinct(skeleton, order, FINALISTS) + _distinct(skeleton, order[turned], OPPOSITE))
     poses = np.array([_searched(finder, frame, pyramid, pose) for pose in np.unique(finalists, axis=0)])
-    residual = finder.mean_residual(pyramid, poses, frame.uncertain)
-    best = int(np.argmin(residual))
-    others = np.flatnonzero(_turned(skeleton, poses, poses[best]) & (residual < NEARLY * residual[best]))
-    opposite = others[np.argsort(residual[others], kind="stable")[:1]]
-    similar = np.flatnonzero(residual < AMBIGUOUS * residual[best])
-    rest = np.union1d(opposite, similar)
-    rest = rest[np.argsort(residual[rest], kind="stable")]
-    return float(residual[best]), _distinct(skeleton, poses[np.concatenate([[best], rest])], len(poses))
+    cost = finder.score(pyramid, poses, frame.uncertain)
+    best = int(np.argmin(cost))
+    others = np.flatnonzero(_turned(skeleton, poses, poses[best]) & (cost < cost[best] + OPPOSITE_OPEN))
+    opposite = others[np.argsort(cost[others], kind="stable")[:1]]
+    rest = np.union1d(opposite, np.flatnonzero(cost < cost[best] + OPEN))
+    rest = rest[np.argsort(cost[rest], kind="stable")]
+    residual = float(finder.mean_residual(pyramid, poses[best : best + 1], frame.uncertain)[0])
+    return residual, _distinct(skeleton, poses[np.concatenate([[best], rest])], len(poses))
 
 
 def _follow(
@@ -200,12 +195,13 @@ def _follow(
         return []
     F = len(frames)
     poses = np.tile(np.array(starts)[:, None], (1, F, 1))
-    residuals = np.full((len(starts), F), np.nan)
+    residuals, costs = np.full((2, len(starts), F), np.nan)
 
     def residual_of(i: int, poses: Float) -> Float:
         return finder.mean_residual(pyramids[i], poses, frames[i].uncertain)
 
     residuals[:, anchor] = residual_of(anchor, poses[:, anchor])
+    costs[:, anchor] = finder.score(pyramids[anchor], poses[:, anchor], frames[anchor].uncertain)
     every = finder.search_frames
     for step, end in ((1, F), (-1, -1)):
         for i in range(anchor + step, end, step):
@@ -217,13 +213,14 @@ def _follow(
                 poses[:, i] = last
                 continue
             high = residual > WORSE * residuals[:, anchor]
-            means = np.nanmean(residuals, axis=1)  # no search brings back a trajectory that is worse by far
-            searched = (high | (abs(i - anchor) % every == 0)) & (means <= AMBIGUOUS * means.min()) if every else []
+            means = np.nanmean(costs, axis=1)  # no search brings back a trajectory that is worse by far
+            searched = (high | (abs(i - anchor) % every == 0)) & (means <= means.min() + OPEN) if every else []
             for b in np.flatnonzero(searched):
                 now[b] = finder.improved(frames[i], pyramids[i], now[b])
                 residual[b] = residual_of(i, now[b : b + 1])[0]
             poses[:, i], residuals[:, i] = now, residual
-    means = np.nanmean(residuals, axis=1)
+            costs[:, i] = finder.score(pyramids[i], now, frames[i].uncertain)
+    means = np.nanmean(costs, axis=1)
     return [TrajectoryHypothesis(one, float(mean)) for one, mean in zip(poses, means, strict=True)]
 
 

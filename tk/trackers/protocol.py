@@ -39,7 +39,7 @@ class Observation:
             the scene's colour. A body part there costs half. None if unknown.
         time: time stamp of the source, seconds.
         sources: (C,) uint8, where a segmenter's masks come from, see :mod:`tk.run.learned_masks`; None for others.
-        landmarks: (N, 12, 3) m, joints of all people in view by a segmenter's network, see
+        landmarks: (N, C, L, 3) x, y, pixels, and visibility of the landmarks of N people in view, see
             :mod:`tk.model.cues.landmarks`; NaN where they are unknown. None if no network saw this frame.
     """
 
@@ -73,6 +73,7 @@ class Estimate:
             in what :func:`tk.track` hands out. drawn: (C, h, w) bool, where the body is on the tracker's grid of rays,
             cameras left out included; None likewise.
         mask_source: (C,) uint8, as ``Observation.sources``.
+        landmarks: (C, L, 3) those of this person among ``Observation.landmarks``; None if there are none.
         frame, time: the frame's number in the capture, and seconds; whoever steps the tracker knows them.
         person: the person's number in the run.
     """
@@ -89,6 +90,7 @@ class Estimate:
     masks: NDArray[np.uint8] | None = None
     drawn: NDArray[np.bool_] | None = None
     mask_source: NDArray[np.uint8] | None = None
+    landmarks: Float | None = None
     frame: int = -1
     time: float = 0.0
     person: int = 0
@@ -254,6 +256,7 @@ class TwoPassTracker(Tracker, Protocol):
         lost: NDArray[np.bool_],
         residual: Float,
         height_m: float | None,
+        landmarks: Float | None = None,
         keep_body: bool = False,
         report: Callable[[float], None] = lambda _: None,
     ) -> tuple[Float, Float, Float]:
@@ -265,6 +268,7 @@ class TwoPassTracker(Tracker, Protocol):
             lost: (F,) bool; such frames are not used and do not change.
             residual: (F, C, 2) of the first pass; NaN where a camera was excluded.
             height_m: the subject's height, if known.
+            landmarks: (F, C, L, 3) of the first pass, NaN where there are none.
             keep_body: leave the body as it is.
             report: receives the share of the work that is done.
 

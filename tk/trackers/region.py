@@ -27,14 +27,12 @@ from numpy.typing import NDArray
 from tk.kernels.mask_values import PERSON
 from tk.kernels.silhouette import normal_equations
 from tk.model.body.body_fit import STATURE_DEVIATION
-from tk.model.body.initial_pose import pose_of_joints
 from tk.model.body.joint_sigma import VIEW_M, contour_variance, directions, posture_variance, view_variance
 from tk.model.body.limb_candidates import Limb, turned
 from tk.model.body.skeleton import JOINTS
-from tk.model.cameras.bundle import CORRELATION_PX
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import determine_depth
-from tk.model.cues.landmarks import ROWS, contradiction, of_person
+from tk.model.cues.landmarks import propose
 from tk.model.cues.part_colors import color_bins
 from tk.model.cues.ray_costs import Evidence
 from tk.model.cues.visible_contours import contour_shares
@@ -42,11 +40,12 @@ from tk.model.masks.mosaic import doubled
 from tk.model.masks.regions import SQUARE3
 from tk.model.masks.silhouettes import Pyramid
 from tk.model.setup import Setup, Subject
-from tk.optim.gauss_newton import GaussNewtonSettings, Prior
+from tk.optim.gauss_newton import GaussNewtonSettings
+from tk.optim.quadratic import Quadratic
 from tk.settings import RegionSettings, Settings, SilhouetteSettings
-from tk.trackers.contour_finder import GAIN
+from tk.trackers.contour_finder import INFORMATION
 from tk.trackers.contour_tracker import RECOVER_EVERY, ContourTracker
-from tk.trackers.hypotheses import MARGIN, PATIENCE, RENEWAL, Hypothesis, disagreement
+from tk.trackers.hypotheses import DROPPED, PATIENCE, RENEWAL, Hypothesis, disagreement
 from tk.trackers.limb_search import SAME_POSE_M
 from tk.trackers.protocol import Estimate, Observation, Stopwatch
 from tk.trackers.residual import ResidualBaseline, variance_factor
@@ -57,8 +56,6 @@ Float = NDArray[np.float64]
 # Frames over which the mean posture is a plain mean; then the oldest are forgotten.
 _POSTURE_FRAMES = 200
 
-# Information of one pixel of contour, 1/px²: edgels err by 2 px.
-INFORMATION = 1.0 / (2.0**2 * CORRELATION_PX)
 # Scales of a frame, at least: from the finest alone Gauss-Newton does not converge.
 FEWEST = 2
 # Rate up to which a frame has all iterations, Hz. With one over-relaxed iteration a scale at 15 Hz, no mean error of
@@ -75,10 +72,6 @@ ANGLE_DEG, TRANSLATION_M = 40.0, 0.3
 # fold, cube, punch and kick with all, three and two cameras it is 1.67 to 2.4 in the median of 20 frames; of small
 # pictures of a walk of 14 frames 1.21; of a person with poor masks 1.05, and 1.00 or less if back was taken for front.
 AMBIGUOUS_HEADING = 1.15
-# Landmarks contradict a pose if they are farther from its trunk, arms or legs than this, metres. They are up to 0.14
-# off in correct poses. With 0.15, dance, fold, cube and pair without an empty scene, with two to six cameras, have the
-# same results.
-CONTRADICTED_M = 0.2
 # After this many consecutive frames with a high residual, and two failed searches for the person, sigma is set to NaN.
 UNKNOWN_AFTER = 2 * RECOVER_EVERY
 # Masks are searched for carried objects if this share of their pixels has colours that are not the person's; objects
@@ -208,9 +201,10 @@ class RegionTracker(ContourTracker):
         cost, met = evidence.cast(self.body, poses)
         if not np.isfinite(cost).all():
             return self._nobody(frame, watch)
+        nats = evidence.nats(cost, poses)
         self._alive = [
             Hypothesis(pose, h.pose, h.cost + RENEWAL * (c - h.cost) if h.age else float(c), h.age + 1)
-            for h, pose, c in zip(self._alive, poses, cost, strict=True)
+            for h, pose, c in zip(self._alive, poses, nats, strict=True)
         ]
         self._rank()
         i = int(np.argmin([np.abs(pose - self._best.pose).max() for pose in poses]))
@@ -221,12 +215,9 @@ class RegionTracker(ContourTracker):
             look = self._look(evidence, pyramid, images)
         misplaced = self.misplaced(evidence, look.label)
         searched = self._needs_search(frame, look, misplaced, evidence.hidden(look.label))
-        if searched:
-            settled = self._best.pose
-            self._propose(frame, pyramid, evidence, images, misplaced)
-            if self._best.pose is not settled:
-                look = self._look(evidence, pyramid, images)
-        if frame.landmarks is not None and self._contradicted(frame.landmarks, pyramid, evidence, images):
+        settled = self._best.pose
+        self._propose(frame, pyramid, evidence, images, misplaced if searched else None)
+        if self._best.pose is not settled:
             look = self._look(evidence, pyramid, images)
         watch.lap("search")
         followed = self._best.pose
@@ -247,13 +238,14 @@ class RegionTracker(ContourTracker):
         return Estimate(
             **self.pose_fields(pose),
             status=status,
-            objective=float(self._best.cost),
+            objective=float(np.nanmean(look.error)),
             iterations=np.array([iterations.sum(), int(searched)], np.int32),
             timing=watch.laps,
             sigma=sigma,
             residual=look.residual,
             masks=pyramid.masks[0],
             drawn=look.label > 0,
+            landmarks=pyramid.landmarks,
         )
 
     def without_foreign(self, frame: Observation) -> Observation:
@@ -320,16 +312,16 @@ class RegionTracker(ContourTracker):
                 solver = replace(solver, iterations=fewer, relaxation=1.0 if plain else solver.relaxation)
         return list(range(first, -1, -1)), solver
 
-    def prior(self, mean: Float, angle_deg: float = ANGLE_DEG) -> Prior:
+    def prior(self, mean: Float, angle_deg: float = ANGLE_DEG) -> Quadratic:
         """Return the prior: straight joints about zero, all other degrees of freedom about ``mean`` (..., D)."""
         skeleton = self.body.skeleton
         deviation = np.where(skeleton.prismatic, TRANSLATION_M, np.radians(angle_deg))
         straight = skeleton.is_straight
         deviation[straight] = skeleton.straight[straight]
-        return Prior(np.where(straight, 0.0, mean), deviation**-2 / INFORMATION)
+        return Quadratic.about(np.where(straight, 0.0, mean), deviation**-2 / INFORMATION)
 
     def _rank(self) -> None:
-        """Sort the hypotheses by cost; drop those that cost :data:`MARGIN` more than the best, are too old or equal."""
+        """Sort the hypotheses by cost; drop those that are improbable beside the best, too old or equal."""
         if len(self._alive) == 1:
             self._alive = [replace(self._alive[0], age=1)]
             return
@@ -337,7 +329,7 @@ class RegionTracker(ContourTracker):
         kept: list[Hypothesis] = []
         joints: list[Float] = []
         for h in sorted(self._alive, key=lambda h: h.cost):
-            if kept and (h.cost > kept[0].cost + MARGIN or h.age > PATIENCE):
+            if kept and (h.cost > kept[0].cost + DROPPED or h.age > PATIENCE):
                 continue
             if all(skeleton.apart(h.pose, other) > SAME_POSE_M for other in joints):
                 kept.append(h)
@@ -366,42 +358,24 @@ class RegionTracker(ContourTracker):
         pyramid: Pyramid,
         evidence: Evidence,
         images: NDArray[np.uint8] | None,
-        misplaced: Sequence[Limb],
+        misplaced: Sequence[Limb] | None,
     ) -> None:
-        """Add the poses of a limb search to the hypotheses, with their cost relative to the best one's running mean."""
-        best = self._best
-        poses, cost = self.search(frame, pyramid, evidence, best.pose, images, misplaced)
+        """Add the pose of the landmarks, and those of a limb search, to the hypotheses, with their cost relative to the
+        best one's running mean. ``misplaced``: see :meth:`search`; None: limbs are not searched for."""
+        best, further = self._best, np.empty((0, len(self._best.pose)))
+        if pyramid.landmarks is not None:
+            self._heading_known = True
+            further = propose(self.views.rig, self.body.skeleton, pyramid.landmarks)
+        if misplaced is None and not len(further):
+            return
+        poses, cost = self.search(frame, pyramid, evidence, best.pose, images, misplaced, further)
         gain = cost[0] - cost
-        # a gain within the noise of two casts counts only if it lasts over the next frames
         self._alive += [
-            Hypothesis(pose, best.previous, best.cost - RENEWAL * float(g if g > GAIN else min(g, 0.0)), jumped=True)
+            Hypothesis(pose, best.previous, best.cost - RENEWAL * float(g), jumped=True)
             for pose, g in zip(poses[1:], gain[1:], strict=True)
-            if g > -MARGIN / 2
+            if g > -DROPPED / 2
         ]
         self._rank()
-
-    def _contradicted(
-        self, landmarks: Float, pyramid: Pyramid, evidence: Evidence, images: NDArray[np.uint8] | None
-    ) -> bool:
-        """If landmarks contradict the best pose, and the silhouettes allow the pose that they show, take that for the
-        best one; return whether that is so."""
-        skeleton, best = self.body.skeleton, self._best
-        joints = skeleton.joints(best.pose)
-        seen = of_person(self.world.points_in(landmarks), joints)
-        if seen is None:
-            return False
-        self._heading_known = True
-        before = contradiction(seen, joints)
-        if before < CONTRADICTED_M:
-            return False
-        known = np.isfinite(seen).all(axis=1)
-        start = pose_of_joints(skeleton, ROWS[known], seen[known])[None]
-        pose = self.settle(pyramid, start, images=images, prior=self.prior(start)).states[0]
-        more = float(np.diff(evidence.costs(self.body, np.stack([best.pose, pose])))[0])
-        if contradiction(seen, skeleton.joints(pose)) >= before or more > MARGIN:
-            return False
-        self._alive = [Hypothesis(pose, pose, best.cost + more)]
-        return True
 
     def _recover(self, pyramid: Pyramid, by_view: Float) -> bool:
         """Return whether the person is lost; if so, or if the residual (E_S, (V,)) stays high, search for the person
@@ -456,7 +430,7 @@ class RegionTracker(ContourTracker):
             variance += disagreement(skeleton, poses, cost)
         return np.asarray(np.sqrt(variance))
 
-    def variance(self, pose: Float, curvature: Float, prior: Prior, label: NDArray[np.uint8], residual: Float) -> Float:
+    def variance(self, pose: Float, curvature: Float, prior: Quadratic, label: NDArray[np.uint8], residual: Float) -> Float:
         """Return (..., J) variance of the joints' positions along an axis, metres², from the contours' noise and the
         directions of the views, scaled by the residual; NaN if the views used do not determine depth.
 
@@ -469,7 +443,7 @@ class RegionTracker(ContourTracker):
         """
         body = self.body
         joints = body.skeleton.joints(pose)
-        precision = INFORMATION * (curvature + np.diag(prior.precision))
+        precision = INFORMATION * (curvature + prior.matrix[0])
         noise = contour_variance(body.skeleton, pose, precision)
         rays = joints[..., None, :, :] - self.world.rig.centers[:, None]
         rays /= np.sqrt((rays**2).sum(axis=-1, keepdims=True))
@@ -487,13 +461,14 @@ class RegionTracker(ContourTracker):
         lost: NDArray[np.bool_],
         residual: Float,
         height_m: float | None,
+        landmarks: Float | None = None,
         keep_body: bool = False,
         report: Callable[[float], None] = lambda _: None,
     ) -> tuple[Float, Float, Float]:
         """See :class:`~tk.trackers.protocol.TwoPassTracker` and :mod:`tk.trackers.second_pass`."""
         if lost.all():
             return poses, residual, np.zeros((len(poses), len(JOINTS)))
-        again = SecondPass(self, masks, self.world.poses_in(poses), lost, residual, report)
+        again = SecondPass(self, masks, landmarks, self.world.poses_in(poses), lost, residual, report)
         if self.contours.adapt and not keep_body:
             again.fit_body(height_m)
         again.optimise(again.tracked)

@@ -31,7 +31,7 @@ from tk.model.body.limb_candidates import Limb, exchanged
 from tk.model.body.skeleton import JOINTS
 from tk.model.cues.ray_costs import Evidence, residual_of
 from tk.model.masks.silhouettes import Pyramid
-from tk.trackers.hypotheses import MARGIN, RENEWAL
+from tk.trackers.hypotheses import DROPPED, RENEWAL
 from tk.trackers.limb_search import SAME_POSE_M
 
 if TYPE_CHECKING:
@@ -48,13 +48,10 @@ STATURE = 0.03
 AT_ONCE = 16
 # Scale at which other poses are optimised.
 LEVEL = 1
-# Negative logarithms of likelihoods: a frame's is its cost divided by the first value, which is larger than the noise
-# of one frame because consecutive frames err alike; a step's is its length divided by the second value. Half and twice
-# each, and the scales 0 and 2, change the mean error of eight results (dance, fold, cube, walk, treadmill-slow with two
-# cameras, the first three also with three) by 0.05 cm at most. The decision lowers it from 2.74 to 2.57 cm. In frames
-# with pixels of other people another pose costs COST more: limbs of one person of a rendered embrace are 2.97 cm off
-# without it, 2.61 with 0.4 and 2.05 with 1.6 times the value; of seven other people 0.3 cm more with 1.6 times at most.
-COST, STEP_M = 0.01, SAME_POSE_M
+# Seconds within which frames err alike: the likelihood of a frame counts by its share of this time. The negative
+# logarithm of a step's probability is its length divided by STEP_M. In frames with pixels of other people another pose
+# costs SHARED nats more, because the masks do not show the colours by which the first pass has chosen.
+CORRELATED_S, STEP_M, SHARED = 0.17, SAME_POSE_M, 1.0
 
 
 @dataclass(frozen=True)
@@ -78,6 +75,7 @@ class SecondPass:
     Args:
         tracker: with the body and the cameras of this pass.
         masks: (C, H, W) of each frame, cleaned.
+        landmarks: (F, C, L, 3) of each frame, NaN where there are none; None if no frame has any.
         poses: (F, D) of the first pass.
         lost: (F,) bool; such frames are not used and do not change.
         residual: (F, C, 2) of the first pass; a camera whose residual is NaN in a frame is not used in it.
@@ -92,12 +90,15 @@ class SecondPass:
         self,
         tracker: RegionTracker,
         masks: Sequence[NDArray[np.uint8]],
+        landmarks: Float | None,
         poses: Float,
         lost: NDArray[np.bool_],
         residual: Float,
         report: Callable[[float], None],
     ) -> None:
         self.tracker, self._masks, self._report = tracker, masks, report
+        self._landmarks = landmarks
+        self._share = min(1.0, 1.0 / (tracker.fps * CORRELATED_S))
         self.tracked = np.flatnonzero(~lost)
         self.poses, self.residual = poses.copy(), np.array(residual)
         self._variance = np.zeros((2, len(poses), len(JOINTS)))  # of the pose, and of the choice between two
@@ -128,7 +129,7 @@ class SecondPass:
         """Optimise frames near their present poses."""
         tracker, grid = self.tracker, self.tracker.screen
         for chunk in (frames[k : k + AT_ONCE] for k in range(0, len(frames), AT_ONCE)):
-            seen = Pyramid((np.concatenate([self._seen(i) for i in chunk]),), (tracker.views.sizes,))
+            seen = Pyramid.of_all([self._pyramid(i) for i in chunk], 0)
             prior = tracker.prior(self.poses[chunk], ANGLE_DEG)
             settled = tracker.settle(seen, self.poses[chunk], (0,), prior=prior)
             self.poses[chunk] = settled.states
@@ -154,7 +155,7 @@ class SecondPass:
                 joints = skeleton.joints(np.array([self.poses[frames], other[frames]]))
                 steps = np.linalg.norm(joints[:, None, :-1] - joints[None, :, 1:], axis=-1).max(axis=-1)
                 steps[:, :, np.diff(frames) > 1] = 0.0  # anything may happen in lost frames
-                share = second_of_two(cost[frames] / COST, steps / STEP_M)
+                share = second_of_two(cost[frames], steps / STEP_M)
                 apart = ((joints[1] - joints[0]) ** 2).sum(axis=-1) / 3
                 self._variance[1, frames] += (share * (1.0 - share))[:, None] * apart
                 self.poses[frames[share > 0.5]] = other[frames[share > 0.5]]
@@ -165,7 +166,7 @@ class SecondPass:
 
         Returns:
             poses (A, F, D), and by how much they cost more than the present ones (A, F). Where an alternative has
-            become the present pose, or costs :data:`MARGIN` more, its pose is the present one.
+            become the present pose, or is improbable beside them, its pose is the present one.
         """
         order, result = self.tracked[::step], np.repeat(self.poses[None], len(alternatives), axis=0)
         cost, mean = np.zeros(result.shape[:2]), np.full(len(alternatives), np.nan)  # NaN: none is tracked
@@ -194,11 +195,12 @@ class SecondPass:
                 costs = self._costs(pyramid, np.concatenate([present[None], poses[differ]]))
                 more = costs[1:] - costs[0]
                 mean[differ] = np.where(np.isnan(known[differ]), more, known[differ] + RENEWAL * (more - known[differ]))
-                mean[mean > MARGIN] = np.nan
+                mean[mean > DROPPED] = np.nan
                 kept = np.isfinite(mean[differ])
                 # a limb behind other people costs nothing, and only the first pass sees its colours
-                hidden = COST * (pyramid.masks[0] == OTHERS).any()
-                result[differ[kept], i], cost[differ[kept], i] = poses[differ[kept]], more[kept] + hidden
+                hidden = SHARED * (pyramid.masks[0] == OTHERS).any()
+                result[differ[kept], i] = poses[differ[kept]]
+                cost[differ[kept], i] = self._share * more[kept] + hidden
         return result, cost
 
     def _starts(self, one: Alternative, lasts: NDArray[np.int64], frames: NDArray[np.int64], step: int) -> Float:
@@ -238,8 +240,11 @@ class SecondPass:
         self._report(min(self._done / (3 * len(self.tracked)), 1.0))
 
     def _pyramid(self, i: int, scales: int = 1) -> Pyramid:
-        """Return the scales of the masks of frame i."""
-        return self.tracker.views.pyramid(self._seen(i), scales, False)
+        """Return the scales of the masks of frame i, and its landmarks."""
+        landmarks = None if self._landmarks is None else self._landmarks[i]
+        if landmarks is not None and not np.isfinite(landmarks).any():
+            landmarks = None
+        return self.tracker.views.pyramid(self._seen(i), scales, False, landmarks)
 
     def _seen(self, i: int) -> NDArray[np.uint8]:
         """Return the masks (C, H, W) of frame i, empty where a camera is not used."""
@@ -250,8 +255,8 @@ class SecondPass:
         return shown
 
     def _costs(self, pyramid: Pyramid, poses: Float) -> Float:
-        """Return the costs (B,) of poses (B, D) by masks alone, mean over the views."""
-        return Evidence.of(self.tracker.screen, pyramid.masks[0]).costs(self.tracker.body, poses)
+        """Return the costs (B,) of poses (B, D) by masks and landmarks, nats."""
+        return self.tracker.score(pyramid, poses)
 
 
 def second_of_two(cost: Float, steps: Float) -> Float:

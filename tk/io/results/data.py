@@ -69,6 +69,7 @@ class ResultMeta:
     joint_names: tuple[str, ...] = JOINTS  # J names in the order of `/joints/position`
     sigma: bool = False  # True if `/joints/sigma` exists
     residual_cameras: tuple[str, ...] = ()  # names of the C cameras of `/residual` and `/mask_source`
+    landmark_names: tuple[str, ...] = ()  # names of the L landmarks; empty if no network sees landmarks
     mask_sources: tuple[str, ...] = ()  # meanings of the values of `/mask_source`; empty if no segmenter makes masks
     segment_names: tuple[str, ...] = ()  # names of the segments of `/segments/rotation`
     feet: bool = False  # True if `/feet/position` exists, the points `tk.model.body.joints.FOOT_POINTS`
@@ -181,6 +182,8 @@ class Result:
     created: str
     sigma: Float | None = None  # (F, J) metres, NaN for a joint without evidence
     mask_source: NDArray[np.uint8] | None = None  # (F, C), meanings in meta.mask_sources
+    # (F, C, L, 3) x, y, pixels of the recorded images, and visibility; NaN where no network was asked
+    landmarks: NDArray[np.float32] | None = None
     residual: Float | None = None  # (F, C, 2) missing and surplus area, shares of the person's pixels
     segments_rotation: Float | None = None  # (F, S, 4) w, x, y, z; segment to world
     feet: Float | None = None  # (F, 4, 3) metres

@@ -35,6 +35,7 @@ ATTRIBUTES = {
 #: field that lists what a letter of a shape counts; `k` counts the angles of one joint
 COUNTED = {
     "D": "pose_names", "J": "joint_names", "S": "segment_names", "C": "residual_cameras", "T": "stages", "k": "names",
+    "L": "landmark_names",
 }  # fmt: skip
 
 
@@ -125,6 +126,12 @@ ROWS = (
         "segmenter where the scene is unknown, 2 the segmenter",
         {"cameras": "residual_cameras", "meaning": "mask_sources"}, field="mask_source", optional="mask_sources",
         valid=(0, 2),
+    ),
+    Dataset(
+        "landmarks", "F C L 3", "float32",
+        "the person's landmarks in each image by a segmenter's network: x, y, pixels of the recorded image, and "
+        "visibility; NaN where the network was not asked",
+        {"names": "landmark_names", "cameras": "residual_cameras"}, field="landmarks", optional="landmark_names",
     ),
     Dataset("iterations", "F T", "int32", "optimiser iterations by stage", {"stages": "stages"}, field="iterations"),
     Dataset(

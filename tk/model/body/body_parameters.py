@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tk.kernels.cones import CONE
 from tk.kernels.silhouette import Edgels
 from tk.model.body.anthropometry import DIMENSIONS, BodyDimensions
+from tk.model.body.body_points import SEGMENT, places
 from tk.model.body.cone_body import SHAPE_NUMBERS, ConeBody, ConePart, build_cone_body, group_of, part_arrays
 from tk.model.body.skeleton import build_skeleton
 
@@ -101,6 +102,16 @@ class BodyFamily:
         moves = s.segment_moves(poses, point, rise)
         twists = np.concatenate(s.twists(poses), axis=-1).swapaxes(-1, -2)
         return LinearisedBody(body, s.segment_transforms(poses), twists, by_part.transpose(1, 2, 0), moves)
+
+    def landmark_rows(self, shared: Float, body: ConeBody, pose: Float) -> Float:
+        """Return the derivatives (L, 3, K) of the points that landmarks mark by the parameters (K,), at a pose (D,)."""
+        step = _STEP * np.eye(len(DIMENSIONS))
+        dimensions = [BodyDimensions.of(np.exp(shared[: len(DIMENSIONS)] + row)) for row in step]
+        moved = np.array([build_skeleton(d).points(pose, SEGMENT, places(d)) for d in dimensions])
+        rows = np.zeros((*moved.shape[1:], len(shared)))
+        now = build_skeleton(body.dimensions).points(pose, SEGMENT, places(body.dimensions))
+        rows[..., : len(DIMENSIONS)] = ((moved - now) / _STEP).transpose(1, 2, 0)
+        return rows
 
     def add_prior(self, shared: Float, H: Float, g: Float) -> None:
         """Add the prior at parameters (K,) to their normal equations (K, K), (K,)."""

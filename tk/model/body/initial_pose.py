@@ -66,8 +66,11 @@ def pose_of_joints(skeleton: Skeleton, rows: NDArray[np.int64], targets: Float) 
     for shoulder, hip in zip(SHOULDERS, HIPS, strict=True):  # arms down, legs together
         rest[[skeleton.index(f"{shoulder}_{angle}") for angle in ("yaw", "pitch")]] = hanging
         rest[skeleton.index(f"{hip}_yaw")] = 0.0
-    start = np.repeat(rest[None], _HEADINGS, 0)
-    start[:, skeleton.index("torso_yaw")] = np.arange(_HEADINGS) * 2 * np.pi / _HEADINGS
+    seated = rest.copy()  # from a straight leg a folded one is not reached
+    for hip, knee in zip(HIPS, (LIMBS[leg][1] for leg in ("leg_l", "leg_r")), strict=True):
+        seated[skeleton.index(f"{hip}_pitch")], seated[skeleton.index(f"{knee}_flexion")] = -np.pi / 2, np.pi / 2
+    start = np.repeat(np.stack([rest, seated]), _HEADINGS, 0)
+    start[:, skeleton.index("torso_yaw")] = np.tile(np.arange(_HEADINGS) * 2 * np.pi / _HEADINGS, 2)
     for pose in start:
         pose[:3] = targets.mean(axis=0) - skeleton.joints(rest)[rows].mean(axis=0)
     precision = np.where(skeleton.prismatic, 0.0, _ANGLE**-2.0)

@@ -226,8 +226,18 @@ class Skeleton:
         """Return joint centres (..., J, 3), metres, world frame, at poses (..., D), in the order of :data:`JOINTS`."""
         if np.ndim(pose) == 2 and len(pose) > _BLOCK:
             return np.concatenate([self.joints(block) for block in blocks(pose)])
-        T = self.segment_transforms(pose)[..., self.joint_segment, :, :]
-        return np.asarray((T[..., :3, :3] @ self.joint_position[:, :, None])[..., 0] + T[..., :3, 3])
+        return self.points(pose, self.joint_segment, self.joint_position)
+
+    def points(self, pose: Float, segment: NDArray[np.int32], place: Float) -> Float:
+        """Return points (..., N, 3), metres, world frame, at poses (..., D).
+
+        Args:
+            pose: the poses.
+            segment: (N,) the segment that carries each point.
+            place: (N, 3) the points in the zero configuration, metres.
+        """
+        T = self.segment_transforms(pose)[..., segment, :, :]
+        return np.asarray((T[..., :3, :3] @ place[:, :, None])[..., 0] + T[..., :3, 3])
 
     def apart(self, poses: Float, joints: Float) -> Float:
         """Return the largest distance (...) of the joints of poses (..., D) from others (J, 3), metres."""
@@ -235,9 +245,13 @@ class Skeleton:
 
     def joint_jacobian(self, poses: Float) -> Float:
         """Return the derivatives (..., J, 3, D) of :meth:`joints` at poses (..., D)."""
+        return self.point_jacobian(poses, self.joint_segment, self.joints(poses))
+
+    def point_jacobian(self, poses: Float, segment: NDArray[np.int32], points: Float) -> Float:
+        """Return the derivatives (..., N, 3, D) of :meth:`points` (..., N, 3) at poses (..., D)."""
         w, v = self.twists(poses)
-        moved = cross(w[..., None, :, :], self.joints(poses)[..., None, :]) + v[..., None, :, :]
-        return np.swapaxes(moved * self.ancestors[self.joint_segment][:, :, None], -1, -2)
+        moved = cross(w[..., None, :, :], points[..., None, :]) + v[..., None, :, :]
+        return np.swapaxes(moved * self.ancestors[segment][:, :, None], -1, -2)
 
     @cached_property
     def ancestors(self) -> NDArray[np.bool_]:

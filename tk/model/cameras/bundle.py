@@ -23,6 +23,7 @@ from tk.model.block_least_squares import Equations
 from tk.model.body.body_parameters import BodyFamily
 from tk.model.body.skeleton import SEGMENTS, Skeleton
 from tk.model.cameras.camera import Camera, Rig
+from tk.model.cues.landmarks import WEIGHT, LandmarkCue
 from tk.model.masks.silhouettes import Pyramid, Views
 
 Float = NDArray[np.float64]
@@ -200,10 +201,18 @@ class ContourBundle:
                 columns = [slice(0, D), slice(own, own + k), slice(D + S - K, D + S)]
                 rows = np.hstack([by_pose[i:j], *by_camera, by_body[i:j]])
                 found.add(view.frame, columns, rows, self._information * view.edgels.weight, view.edgels.distance)
+        # offsets of landmarks are the same in all frames, so that many frames say as much as one
+        seen = WEIGHT / max(sum(frame.pyramid.landmarks is not None for frame in self.frames), 1)
         precision = np.full(D, POSE_DEVIATION**-2.0)
         precision[P:] = (self._segment_m or 1.0) ** -2.0
         for f, (frame, pose) in enumerate(zip(self.frames, state.poses, strict=True)):
             difference, excess = np.zeros(D), np.zeros(D)
+            if frame.pyramid.landmarks is not None:
+                rows = LandmarkCue(state.rig, linear.body, frame.pyramid.landmarks).rows(pose[None])
+                by_body = self.family.landmark_rows(state.body, linear.body, pose)
+                H, g = rows.normal_equations(np.concatenate([rows.jacobian, by_body[None]], axis=-1))
+                columns = np.concatenate([np.arange(P), np.arange(D + S - K, D + S)])
+                found.add_normal(f, columns, seen * H[0], seen * g[0])
             difference[:P] = np.where(s.is_straight, 0.0, frame.pose) - pose
             excess[:P] = s.clip(pose) - pose
             found.add_block_prior(f, precision, difference)

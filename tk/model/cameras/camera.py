@@ -217,6 +217,20 @@ class Rig:
         """Return the cameras, each reduced by its factor (C,)."""
         return Rig(tuple(camera.reduced(factor) for camera, factor in zip(self.cameras, factors, strict=True)))
 
+    def recorded_pixels(self, landmarks: Float) -> Float:
+        """Return landmarks (..., C, L, 3), x and y in pixels of these cameras, in pixels of the recorded images."""
+        factor = np.array(self.reductions, np.float64)[:, None, None]
+        result = np.array(landmarks, np.float64)
+        result[..., :2] = (result[..., :2] + 0.5) * factor - 0.5
+        return result
+
+    def reduced_pixels(self, landmarks: Float) -> Float:
+        """Return the inverse of :meth:`recorded_pixels`."""
+        factor = np.array(self.reductions, np.float64)[:, None, None]
+        result = np.array(landmarks, np.float64)
+        result[..., :2] = (result[..., :2] + 0.5) / factor - 0.5
+        return result
+
     def recorded(self) -> Rig:
         """Return the cameras of the recorded images."""
         return Rig(tuple(camera.recorded() for camera in self.cameras))

@@ -19,6 +19,7 @@ from tk.kernels.projection import pack_cameras
 from tk.kernels.raycast import Cast, Rays, cast, costs
 from tk.model.body.cone_body import COLOR_GROUPS, ConeBody
 from tk.model.cameras.camera import Rig
+from tk.model.cues.landmarks import LandmarkCue
 from tk.model.cues.part_colors import PartColors, color_bins
 
 Float = NDArray[np.float64]
@@ -29,6 +30,9 @@ COLOR_COST = 0.4
 # Cost of a part on a pixel outside the mask that is uncertain (a shadow, or clothes of the background's colour): both
 # values are equally likely.
 UNCERTAIN_COST = 0.5
+# Negative logarithm of a likelihood for a view's cost of 1: a person's silhouette consists of some 60 areas that err
+# independently, and an area is wrong with a probability of 0.1 to 0.3 (NATS = 60 · log(0.73 / 0.27)).
+VIEW_NATS = 60.0
 # Costs of a view are divided by the number of the person's rays. Where others hide most of the person, the divisor is
 # at least this share of the largest number in any view, so that a hand beside a back counts less than a person.
 # Chosen on pair. With one person (dance and cube, 50 frames) half and twice the value change no mean error.
@@ -83,6 +87,7 @@ class Evidence:
         others: (V, h, w) bool, pixels of other people, where a body costs nothing; None if there are none.
         cost: (V, h, w, G + 1) float32, see :mod:`tk.kernels.raycast`.
         bins: (V, h, w) bin of each ray's colour; None without colours.
+        landmarks: the person's landmarks in the frame; None without any.
     """
 
     grid: RayGrid
@@ -90,6 +95,7 @@ class Evidence:
     cost: NDArray[np.float32]
     bins: NDArray[np.int32] | None
     others: NDArray[np.bool_] | None = None
+    landmarks: LandmarkCue | None = None
 
     @staticmethod
     def of(
@@ -98,8 +104,10 @@ class Evidence:
         uncertain: NDArray[np.bool_] | None = None,
         images: NDArray[np.uint8] | None = None,
         colors: PartColors | None = None,
+        landmarks: LandmarkCue | None = None,
     ) -> Evidence:
-        """Return the costs from masks (V, H, W), uncertain pixels, images, and the learned colours of the parts."""
+        """Return the costs from masks (V, H, W), uncertain pixels, images, the learned colours of the parts, and
+        landmarks."""
         sampled = grid.sample(masks)
         person, others = sampled >= PERSON, sampled == OTHERS
         outside = np.ones(person.shape, np.float32)
@@ -114,7 +122,7 @@ class Evidence:
         bins = None if images is None or images.size == 0 else color_bins(grid.sample(images))
         if bins is not None and colors is not None and colors.known:
             cost[person, 1:] = COLOR_COST * colors.mismatch[bins[person]]
-        return Evidence(grid, person, cost, bins, others if shared else None)
+        return Evidence(grid, person, cost, bins, others if shared else None, landmarks)
 
     def costs(
         self,
@@ -124,15 +132,33 @@ class Evidence:
         before: Cast | None = None,
         most_outside: float = np.inf,
     ) -> Float:
-        """Return (B,) the cost of poses (B, D), mean over the views that see anybody; inf if none does.
+        """Return (B,) the cost of the rays at poses (B, D), mean over the views that see anybody; inf if none does.
 
         ``drawn``, ``before`` and ``most_outside`` as in :func:`tk.kernels.raycast.costs`.
         """
         total = costs(body.arrays, self.grid.packed, self.cost, poses, drawn, before, most_outside)
         return mean_of_views(self.shares(total))
 
+    def score(
+        self,
+        body: ConeBody,
+        poses: Float,
+        drawn: NDArray[np.int32] | None = None,
+        before: Cast | None = None,
+        most_outside: float = np.inf,
+    ) -> Float:
+        """Return (B,) the negative logarithm of the likelihood at poses (B, D), nats, up to a constant of the frame;
+        arguments as for :meth:`costs`."""
+        return self.nats(self.costs(body, poses, drawn, before, most_outside), poses)
+
+    def nats(self, cost: Float, poses: Float) -> Float:
+        """Return :meth:`score` of poses (B, D) whose rays have :meth:`costs` (B,)."""
+        views = max(np.count_nonzero(self._seen), 1)
+        return np.asarray(VIEW_NATS * views * cost + (0.0 if self.landmarks is None else self.landmarks.score(poses)))
+
     def cast(self, body: ConeBody, poses: Float, drawn: NDArray[np.int32] | None = None) -> tuple[Float, Cast]:
-        """Return the cost (B,) as :meth:`costs`, and the parts that the rays meet."""
+        """Return the cost (B,) of the rays, mean over the views that see anybody, inf if none does; and the parts that
+        the rays meet."""
         total, met = cast(body.arrays, self.grid.packed, self.cost, poses, drawn)
         return mean_of_views(self.shares(total)), met
 

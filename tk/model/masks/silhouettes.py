@@ -32,23 +32,36 @@ def clean(mask: Masks) -> Masks:
 
 @dataclass(frozen=True)
 class Pyramid:
-    """Masks at several scales, a factor of two apart."""
+    """What the images of a frame show of a person: masks at several scales, a factor of two apart, and landmarks."""
 
     # (V, H, W) uint8 for each scale, or (F V, H, W) of F frames; scale 0 is the full image. Pixels of other people are
     # `tk.kernels.mask_values.OTHERS`.
     masks: tuple[Masks, ...]
     sizes: tuple[NDArray[np.int32], ...]  # (V, 2) for each scale, width and height of each camera's image
+    # (V, L, 3), or (F, V, L, 3) of F frames: x, y, pixels, and visibility of the person's landmarks; None without any
+    landmarks: Float | None = None
 
     @staticmethod
     def of_all(frames: Sequence[Pyramid], scale: int) -> Pyramid:
         """Join one scale of several frames; the others are empty."""
         none = np.zeros((0, 0, 0), np.uint8)
         joined = np.concatenate([frame.masks[scale] for frame in frames])
-        return Pyramid((none,) * scale + (joined,), frames[0].sizes[: scale + 1])
+        landmarks = all_landmarks([frame.landmarks for frame in frames])
+        return Pyramid((none,) * scale + (joined,), frames[0].sizes[: scale + 1], landmarks)
 
     def of_views(self, views: NDArray[np.intp]) -> Pyramid:
         """Return the scales of some views."""
-        return Pyramid(tuple(masks[views] for masks in self.masks), tuple(sizes[views] for sizes in self.sizes))
+        landmarks = None if self.landmarks is None else self.landmarks[..., views, :, :]
+        masks, sizes = (tuple(each[views] for each in scales) for scales in (self.masks, self.sizes))
+        return Pyramid(masks, sizes, landmarks)
+
+
+def all_landmarks(each: Sequence[Float | None]) -> Float | None:
+    """Return the landmarks of F frames, (V, L, 3) or None each, as (F, V, L, 3); None if no frame has any."""
+    known = [one for one in each if one is not None]
+    if not known:
+        return None
+    return np.array([np.full(known[0].shape, np.nan) if one is None else one for one in each])
 
 
 class Views:
@@ -64,8 +77,8 @@ class Views:
         self._cameras32 = self.cameras.astype(np.float32)
         self.sizes = np.array([(c.width, c.height) for c in rig], np.int32)
 
-    def pyramid(self, masks: Masks, scales: int, cleaning: bool) -> Pyramid:
-        """Return the scales of masks (V, H, W), cleaned if ``cleaning``."""
+    def pyramid(self, masks: Masks, scales: int, cleaning: bool, landmarks: Float | None = None) -> Pyramid:
+        """Return the scales of masks (V, H, W), cleaned if ``cleaning``, with landmarks (V, L, 3)."""
         # everything happens inside boxes around the people
         crops = [(slice(y, y + h), slice(x, x + w)) for x, y, w, h in map(cv2.boundingRect, masks)]
         shared = any((mask[crop] == OTHERS).any() for mask, crop in zip(masks, crops, strict=True))
@@ -83,7 +96,7 @@ class Views:
         for v, crop in enumerate(crops):
             if masks[v][crop].size:
                 _halve([level[v] for level in levels], crop, shared)
-        return Pyramid(tuple(levels), tuple(sizes))
+        return Pyramid(tuple(levels), tuple(sizes), landmarks)
 
     def at(self, pyramid: Pyramid, scale: int) -> Silhouettes:
         """Return a scale of a pyramid, by its index, as the kernels take it."""

@@ -6,13 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.body_points import sole_offset
 from tk.model.body.joints import FOOT_POINTS, FOOT_SEGMENT, JOINTS, LIMBS, SEGMENTS
 from tk.model.body.skeleton import Skeleton
 
 Float = NDArray[np.float64]
-
-# Heel and toe in front of the ankle's centre, shares of the foot's length: as in tk.model.body.cone_body.
-_HEEL, _TOE = -0.2, 0.8
 
 
 def joint_positions(skeleton: Skeleton, transforms: Float) -> Float:
@@ -31,9 +29,3 @@ def foot_points(skeleton: Skeleton, dimensions: BodyDimensions, transforms: Floa
     ankles = skeleton.joint_position[[JOINTS.index(LIMBS["leg" + name[-2:]][2]) for name in FOOT_POINTS]]
     soles = np.array([sole_offset(name, dimensions) for name in FOOT_POINTS]) @ skeleton.T_world_body.T
     return np.einsum("fpab,pb->fpa", T[..., :3, :3], ankles + soles) + T[..., :3, 3]
-
-
-def sole_offset(name: str, dimensions: BodyDimensions) -> Float:
-    """Return the vector (3,) from the ankle to one of the :data:`FOOT_POINTS`, standing body: forward, left, up, m."""
-    share = _HEEL if name.startswith("heel") else _TOE
-    return np.array([share * dimensions.foot, 0.0, -dimensions.ankle_height])

@@ -1,0 +1,76 @@
+"""Points of the body that a network's landmarks mark: joints of the limbs, the face, the feet.
+
+A row of the table is written for the left side; the right one is its mirror image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.joints import LIMBS, ROWS, SEGMENTS
+
+Float = NDArray[np.float64]
+
+# Points of the face as shares of the stature: below the crown, in front of the line from C7/T1 to the crown, and to
+# the side. Head length 0.112, breadth 0.087 and distance of the pupils 0.036 of the stature, ear hole 0.075 below the
+# crown (ANSUR II survey, Gordon et al. 2014, means of men and women).
+_FACE = {"nose": (0.090, 0.075, 0.0), "eye": (0.066, 0.062, 0.018), "ear": (0.076, 0.006, 0.043)}
+
+# Heel and toe in front of the ankle's centre, shares of the foot's length: as in tk.model.body.cone_body.
+_HEEL, _TOE = -0.2, 0.8
+
+
+@dataclass(frozen=True)
+class BodyPoint:
+    """A point that is fixed to a segment."""
+
+    segment: str
+    place: Callable[[BodyDimensions], Float]  # (3,) in the zero configuration, body frame, metres
+
+
+def _face(name: str, side: float) -> BodyPoint:
+    below, front, beside = _FACE[name]
+
+    def place(d: BodyDimensions) -> Float:
+        return ROWS["head_top"].place(d) + d.stature * np.array([front, side * beside, -below])
+
+    return BodyPoint("head", place)
+
+
+def sole_offset(name: str, dimensions: BodyDimensions) -> Float:
+    """Return the vector (3,) from the ankle to heel or toe, standing body: forward, left, up, metres."""
+    share = _HEEL if name.startswith("heel") else _TOE
+    return np.array([share * dimensions.foot, 0.0, -dimensions.ankle_height])
+
+
+def _foot(name: str, side: str) -> BodyPoint:
+    ankle = ROWS[LIMBS["leg" + side][2]].place
+    return BodyPoint("foot" + side, lambda d: ankle(d) + sole_offset(name, d))
+
+
+def _table() -> dict[str, BodyPoint]:
+    points = {"nose": _face("nose", 0.0)}
+    for name in ("eye", "ear"):
+        points |= {name + "_l": _face(name, 1.0), name + "_r": _face(name, -1.0)}
+    for limb in ("arm", "leg"):
+        for pair in zip(LIMBS[limb + "_l"], LIMBS[limb + "_r"], strict=True):
+            points |= {name: BodyPoint(ROWS[name].carrier, ROWS[name].place) for name in pair}
+    for name in ("heel", "toe"):
+        points |= {name + side: _foot(name, side) for side in ("_l", "_r")}
+    return points
+
+
+#: the points by name
+POINTS = _table()
+#: (L,) index of the segment that carries each point
+SEGMENT = np.array([SEGMENTS.index(point.segment) for point in POINTS.values()], np.int32)
+
+
+def places(d: BodyDimensions) -> Float:
+    """Return the points (L, 3) in the zero configuration, body frame, metres."""
+    return np.array([point.place(d) for point in POINTS.values()])
