@@ -31,6 +31,8 @@ _THREADS = 2
 _GRIDS = ((28, 2), (14, 2), (7, 6))
 _HIPS, _CIRCLE = slice(4, 6), slice(6, 8)  # columns: mid-hip point, point on the circle around the body
 _LEAST_SCORE = 0.5  # MediaPipe's value
+# Least probability that the square shows a person. Of people who hide each other, landmarks with 0.24 are right.
+_LEAST_PRESENT = 0.05
 # The pose network's points, each with x, y, z, visibility, presence (MediaPipe's tensors_to_pose_landmarks).
 _POINTS, _COLUMNS = 39, 5
 _VISIBLE = 3  # column, a logit
@@ -101,7 +103,8 @@ class BlazePose:
         used = rows[list(_ROWS.values())].astype(np.float64)
         landmarks = np.column_stack([(used[:, :2] + 0.5) / scale - 0.5, _probability(used[:, _VISIBLE])])
         (present,) = (float(a.item()) for a in found if a.size == 1)
-        if not present >= _LEAST_SCORE:
+        landmarks[:, 2] *= present
+        if not present >= _LEAST_PRESENT:
             landmarks[:] = np.nan
         side = max(height, width)
         # enlarged before thresholding, so that the outline is finer than the network's pixels

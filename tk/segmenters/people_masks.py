@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.model.cameras.camera import Rig
+from tk.model.cameras.landmark_agreement import associated
 from tk.model.cameras.volume import Volume
 from tk.model.cues.landmarks import LANDMARKS
 from tk.model.hull.coarse import CoarseHull
@@ -120,8 +121,9 @@ class PeopleMasks:
         for person in people:
             masks |= person.masks
             uncertain |= person.uncertain
-        landmarks = np.array([person.landmarks for person in people])
-        return Segmented(masks, uncertain & (masks == 0), landmarks.reshape(-1, len(images), len(LANDMARKS), 3))
+        shape = len(people), len(images), len(LANDMARKS), 3
+        landmarks = np.array([person.landmarks for person in people]).reshape(shape)
+        return Segmented(masks, uncertain & (masks == 0), associated(self._rig, landmarks))
 
     def without_specks(self, masks: Images) -> Images:
         """Return masks (C, H, W) without small parts that no other camera shows: shadows, reflections."""

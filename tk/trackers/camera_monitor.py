@@ -23,6 +23,7 @@ from tk.kernels.mask_values import OTHERS
 from tk.model.body.joint_sigma import VIEW_M
 from tk.model.body.plausibility import Plausibility, check_extent, check_stature
 from tk.model.body.skeleton import JOINTS
+from tk.model.cameras.landmark_agreement import evidence_for_cameras
 from tk.model.masks.image_health import MOVED, ImageHealth, described
 from tk.model.masks.mask_agreement import Agreement, MaskAgreement
 from tk.model.setup import Setup, Subject
@@ -52,8 +53,16 @@ def spread_over(frames: Sequence[Observation], count: int = _OPENING) -> list[Ob
 
 
 def opening_agreement(setup: Setup, frames: Sequence[Observation]) -> Agreement:
-    """Return whether the silhouettes of the opening frames agree."""
-    return MaskAgreement(setup.rig, setup.volume).compare([frame.masks for frame in spread_over(frames)])
+    """Return whether the silhouettes of the opening frames agree.
+
+    Masks that contradict the others do not make a camera wrong if a network has made them: they have holes, and pieces
+    of other things. The landmarks that the network saw must contradict the others', too.
+    """
+    found = MaskAgreement(setup.rig, setup.volume).compare([frame.masks for frame in spread_over(frames)])
+    seen = [frame.landmarks for frame in frames if frame.landmarks is not None]
+    if not seen or not (found.wrong or found.refusal):
+        return found
+    return found.confirmed(~(evidence_for_cameras(setup.rig, seen) < 0))
 
 
 class CameraMonitor:

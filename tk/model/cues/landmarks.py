@@ -50,13 +50,17 @@ SEEN_M, HIDDEN, RIGHT_SEEN, RIGHT_HIDDEN = 0.023, 4.0, 0.95, 0.5
 WRONG_DENSITY = 2.0
 # Probability that a network exchanges left and right of one half of the body in an image.
 EXCHANGED = 0.05
+# Probability that all landmarks of an image are wrong: the network shows somebody else.
+ELSEWHERE = 0.02
 # Standard deviation of a landmark's offset from the body's point along each axis, metres.
 OFFSET_M = 0.02
+# Least visibility of landmarks whose box is compared with the box of a mask, and least overlap of both boxes.
+LEAST_VISIBLE, LEAST_OVERLAP = 0.2, 0.2
 # Joints that must be triangulated before they propose a pose: fewer leave a limb open.
 LEAST_PROPOSED = 6
 # Weight of the landmarks in the contours' equations: these count the edgels of a segment as independent, but clothes
 # and wrong pieces of a mask displace all of them together.
-WEIGHT = 10.0
+WEIGHT = 5.0
 # Share of the landmarks' likelihood that counts: a network's errors in neighbouring landmarks go together.
 INDEPENDENT = 0.5
 
@@ -147,7 +151,11 @@ class LandmarkCue:
         halves += np.log([1.0 - EXCHANGED, EXCHANGED])[:, None, None, None]
         total = np.logaddexp(*halves)
         straight = np.exp(halves[0] - total) @ _HALVES  # (B, V, L)
-        w_own, w_other = straight * own_right / own_sigma**2, (1 - straight) * other_right / other_sigma**2
+        image = total.sum(axis=-1) + np.log(1.0 - ELSEWHERE)  # (B, V)
+        image_total = np.logaddexp(image, np.log(ELSEWHERE))
+        shown = np.exp(image - image_total)[..., None]
+        w_own = shown * straight * own_right / own_sigma**2
+        w_other = shown * (1 - straight) * other_right / other_sigma**2
         # rows of the derivative of the position across the ray, metres, by the point
         P = rotation[:, None, :2] - ray[..., :, None] * rotation[:, None, 2:]  # (B, V, L, 2, 3)
         weighted = (w_own + w_other)[..., None, None] * P
@@ -157,7 +165,7 @@ class LandmarkCue:
         size = self._offset / float(np.median(self._sigma)) ** 2
         seen = np.maximum(np.count_nonzero(self._right, axis=-2).mean(axis=-1), 1.0)
         shared = (1.0 + size) / (1.0 + seen * size)
-        return _Likelihood(-INDEPENDENT * shared * total.sum(axis=(-2, -1)), information, pull)
+        return _Likelihood(-INDEPENDENT * shared * image_total.sum(axis=-1), information, pull)
 
     def _match(
         self, ray: Float, depth: Float, ahead: NDArray[np.bool_], order: NDArray[np.int64] | None
@@ -176,6 +184,15 @@ class LandmarkCue:
         inside = right / (2 * np.pi * sigma**2) * np.exp(-0.5 * (r**2).sum(axis=-1) / sigma**2)
         both = inside + (1.0 - right) * WRONG_DENSITY
         return np.log(both / WRONG_DENSITY), inside / both, r, np.broadcast_to(sigma, both.shape)
+
+
+def log_ratio(distance_m: Float, visibility: Float) -> float:
+    """Return the logarithm of the likelihood of landmarks (N,) at distances from where they should be, against that of
+    wrong ones, nats."""
+    sigma = np.hypot(SEEN_M, OFFSET_M) * HIDDEN ** (1.0 - visibility)
+    right = RIGHT_HIDDEN + (RIGHT_SEEN - RIGHT_HIDDEN) * visibility
+    inside = right / (2 * np.pi * sigma**2) * np.exp(-0.5 * (distance_m / sigma) ** 2)
+    return float(INDEPENDENT * np.log(inside / WRONG_DENSITY + 1.0 - right).sum())
 
 
 def _normalised(rig: Rig, landmarks: Float) -> Float:
@@ -202,21 +219,27 @@ def propose(rig: Rig, skeleton: Skeleton, seen: Float) -> Float:
 def of_person(landmarks: Float | None, masks: NDArray[np.uint8]) -> Float | None:
     """Return the landmarks (V, L, 3) of the person whom masks (V, H, W) show, of those of N people (N, V, L, 3).
 
-    They are those of which the largest share of the visible ones lies on the masks, and at least half; None if there
-    are none.
+    In each image the box around the visible landmarks is compared with the box around the mask. The landmarks with the
+    largest overlap (intersection over union, mean over the images) are returned, None if it is below
+    :data:`LEAST_OVERLAP`.
     """
     if landmarks is None or not len(landmarks):
         return None
-    known = np.isfinite(landmarks).all(axis=-1) & (landmarks[..., 2] > 0.5)
-    V, H, W = masks.shape
-    pixels = np.where(known[..., None], landmarks[..., :2], 0.0).round().astype(np.int64)
-    inside = known & (pixels >= 0).all(axis=-1) & (pixels[..., 0] < W) & (pixels[..., 1] < H)
-    x, y = (np.where(inside, pixels[..., k], 0) for k in (0, 1))
-    on = inside & (masks[np.arange(V)[None, :, None], y, x] >= PERSON)
-    shown = (masks >= PERSON).any(axis=(1, 2))
-    count = np.count_nonzero(known & shown[:, None], axis=(1, 2))
-    share = np.count_nonzero(on, axis=(1, 2)) / np.maximum(count, 1)
-    best = int(np.argmax(share))
-    if share[best] < 0.5:
+    shown = np.flatnonzero((masks >= PERSON).any(axis=(1, 2)))
+    overlap = np.zeros(len(landmarks))
+    for v in shown:
+        ys, xs = (np.flatnonzero((masks[v] >= PERSON).any(axis=axis)) for axis in (1, 0))
+        own = np.array([[xs[0], ys[0]], [xs[-1] + 1, ys[-1] + 1]])
+        for n, seen in enumerate(landmarks[:, v]):
+            points = seen[np.isfinite(seen).all(axis=1) & (seen[:, 2] > LEAST_VISIBLE), :2]
+            if len(points) > 1:
+                box = np.array([points.min(axis=0), points.max(axis=0)])
+                common = np.prod(np.maximum(np.minimum(own[1], box[1]) - np.maximum(own[0], box[0]), 0.0))
+                both = np.prod(own[1] - own[0]) + np.prod(box[1] - box[0]) - common
+                overlap[n] += common / both
+    best = int(np.argmax(overlap))
+    if not len(shown) or overlap[best] < LEAST_OVERLAP * len(shown):
         return None
-    return np.where(shown[:, None, None], landmarks[best], np.nan)
+    result = np.full(landmarks.shape[1:], np.nan)
+    result[shown] = landmarks[best, shown]
+    return result

@@ -10,7 +10,7 @@ start of the tracking use the same test. The tests of hulls and sets are ours.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import cv2
@@ -83,6 +83,12 @@ class Agreement:
     closes: Bool
     extent_m: float
     reductions: tuple[int, ...]
+
+    def confirmed(self, cameras: Bool) -> Agreement:
+        """Return the agreement without contradictions of cameras (C,) that other evidence confirms."""
+        wrong = tuple(c for c in self.wrong if not cameras[c])
+        refusal = "" if np.count_nonzero(~cameras) <= len(wrong) else self.refusal
+        return replace(self, wrong=wrong, refusal=refusal)
 
     @property
     def disagreement(self) -> float:

@@ -1,0 +1,77 @@
+"""Landmarks of several images against each other: whose they are, and whether they confirm a camera.
+
+The landmarks of the other cameras are triangulated, by consensus. If those of one camera show the same person and the
+camera is right, they lie at the projections of these points, but for the network's errors; else they lie anywhere on a
+person. The logarithm of the ratio of both likelihoods is the evidence. No wrong mask can make a person's joints fit in
+all images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.model.cameras.camera import Rig
+from tk.model.cameras.triangulation import triangulate_joints
+from tk.model.cues.landmarks import log_ratio
+
+Float = NDArray[np.float64]
+
+
+def evidence_for_cameras(rig: Rig, landmarks: Sequence[Float]) -> Float:
+    """Return (C,) the logarithm of the likelihood ratio, nats, of each camera being right against being wrong; NaN
+    without landmarks of one person in it and in two others.
+
+    Frames of an opening err alike, so they count as one: the mean over the frames is returned.
+
+    Args:
+        rig: C cameras.
+        landmarks: (N, C, L, 3) of N people in each of some frames: x, y, pixels, and visibility; NaN if unknown.
+    """
+    total, count = np.zeros(len(rig)), np.zeros(len(rig))
+    for people in landmarks:
+        found = np.array([[_fit(rig, seen, c, seen[c]) for c in range(len(rig))] for seen in people])
+        known = np.isfinite(found)
+        total += np.where(known, found, 0.0).sum(axis=0)
+        count += known.any(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def associated(rig: Rig, landmarks: Float) -> Float:
+    """Return landmarks (N, C, L, 3) of N people with each image's sets of landmarks given to the people whom they show.
+
+    A network that is asked for a person who stands behind another one may show that one. A set that fits nobody
+    remains with its person if too few other images show the person to tell.
+    """
+    result = landmarks.copy()
+    for c in range(len(rig)):
+        fit = np.array([[_fit(rig, seen, c, other[c]) for other in landmarks] for seen in landmarks])
+        free = np.ones(len(landmarks), np.bool_)
+        open_to = np.isfinite(fit)
+        judged = open_to.any(axis=1)
+        result[judged, c] = np.nan
+        for k in np.argsort(-np.where(open_to, fit, -np.inf), axis=None, kind="stable"):
+            person, given = np.unravel_index(k, fit.shape)
+            if open_to[person, given] and fit[person, given] > 0 and free[given] and np.isnan(result[person, c]).all():
+                result[person, c], free[given] = landmarks[given, c], False
+    return result
+
+
+def _fit(rig: Rig, seen: Float, c: int, own: Float) -> float:
+    """Return the logarithm of the likelihood ratio of landmarks (L, 3) in camera c showing the person whose landmarks
+    (C, L, 3) the others see; NaN if fewer than two others see them."""
+    others = seen.copy()
+    others[c] = np.nan
+    known = np.isfinite(own).all(axis=1)
+    if np.count_nonzero(np.isfinite(others[..., 0]).any(axis=1)) < 2 or not known.any():
+        return np.nan
+    points, _ = triangulate_joints(rig, others)
+    known &= np.isfinite(points).all(axis=1)
+    if not known.any():
+        return np.nan
+    camera = rig[c]
+    pixels, depth = camera.project(points[known])
+    away = (own[known, :2] - pixels) * (depth / np.sqrt(np.linalg.det(camera.matrix[:2, :2])))[:, None]
+    return log_ratio(np.linalg.norm(away, axis=1), own[known, 2])
