@@ -110,8 +110,8 @@ def minimise(
     none = Quadratic(np.zeros((1, len(lower))), np.zeros((1, len(lower), len(lower))))
     for i, scale in enumerate(scales):
         linear, matrix = none if terms is None else terms(states)
-        rows = np.vstack([lower, upper, np.broadcast_to(linear, states.shape)])
-        steps = NewtonSteps(index, rows, matrix, _numbers(config, scale == 0))
+        rows = np.ascontiguousarray(np.vstack([lower, upper, np.broadcast_to(linear, states.shape)]))
+        steps = NewtonSteps(index, rows, np.ascontiguousarray(matrix), _numbers(config, scale == 0))
         states, hessian, made = descend(states, scale, steps)
         iterations[i] = made.max(initial=0)
     return BatchSolution(states, hessian, iterations)

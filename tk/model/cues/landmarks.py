@@ -113,7 +113,10 @@ class LandmarkCue:
         self._sigma = SEEN_M * size * HIDDEN ** (1.0 - visibility)  # (..., V, L)
         self._right = np.where(known, RIGHT_HIDDEN + (RIGHT_SEEN - RIGHT_HIDDEN) * visibility, 0.0)
         self._at = np.where(known[..., None], seen[..., :2], 0.0)
-        self._offset = (OFFSET_M * size) ** 2
+        # what is hidden in the images is guessed in all of them alike
+        images = np.maximum(np.count_nonzero(known, axis=-2), 1)
+        mean = visibility.sum(axis=-2) / images  # (..., L)
+        self._offset = (OFFSET_M * size * HIDDEN ** (1.0 - mean)) ** 2
 
     @cached_property
     def _cameras(self) -> tuple[Float, Float]:
@@ -130,7 +133,7 @@ class LandmarkCue:
         """Return what the landmarks say of the body's points at poses (B, D)."""
         x = self._skeleton.points(poses, SEGMENT, self._place)
         found = self._likelihood(x)
-        spread = np.eye(3) + self._offset * found.information
+        spread = np.eye(3) + self._offset[..., None, None] * found.information
         information = INDEPENDENT * np.linalg.solve(spread, found.information)
         pull = INDEPENDENT * np.linalg.solve(spread, found.pull[..., None])[..., 0]
         return LandmarkRows(information, pull, self._skeleton.point_jacobian(poses, SEGMENT, x))
@@ -162,7 +165,7 @@ class LandmarkCue:
         information = np.einsum("bvlai,bvlaj->blij", weighted, P)
         pull = np.einsum("bvla,bvlai->bli", w_own[..., None] * own_r + w_other[..., None] * other_r, P)
         # the offset is shared by the images: V of them count as fewer
-        size = self._offset / float(np.median(self._sigma)) ** 2
+        size = (OFFSET_M / SEEN_M) ** 2
         seen = np.maximum(np.count_nonzero(self._right, axis=-2).mean(axis=-1), 1.0)
         shared = (1.0 + size) / (1.0 + seen * size)
         return _Likelihood(-INDEPENDENT * shared * image_total.sum(axis=-1), information, pull)
