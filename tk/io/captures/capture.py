@@ -24,7 +24,7 @@ from tk.io.captures.mobo import find_walk, read_cameras
 from tk.io.captures.pictures import PictureClip, picture_number
 from tk.io.captures.timing import check_clock, read_stamps
 from tk.io.captures.timing import resample as resampled
-from tk.io.captures.video import VideoClip, damaged_images
+from tk.io.captures.video import VideoClip, damaged_images, notes_on
 from tk.io.paths import text_of
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import infer_volume, sample_box, views_of
@@ -172,7 +172,7 @@ class Capture:
         lines = []
         for camera in np.flatnonzero(cameras).tolist():
             clip, late = self.clips[camera], self.late_frames[camera]
-            if isinstance(clip, VideoClip) and (bad := damaged_images(clip.path, min(stop - late, _CHECKED_IMAGES))):
+            if isinstance(clip, VideoClip) and (bad := damaged_images(clip, min(stop - late, _CHECKED_IMAGES))):
                 which = described(bad[0] + late, bad[-1] + late, len(bad))
                 lines.append(f"{clip.path}: is damaged in {which}; copy it again, or re-encode the original")
         return lines
@@ -262,7 +262,7 @@ def open_capture(
     if walk and walk.masks is not None and masks == "auto":
         masks = str(walk.masks)
     mask_clips = _open_masks(calibration, path, masks)
-    warnings: list[str] = list(calibration.notes)
+    warnings: list[str] = [*calibration.notes, *notes_on(clips)]
     if settings.unknown:
         warnings.append(f"{path / 'capture.toml'}: unknown keys are ignored: {', '.join(settings.unknown)}")
     _warn_of_units(calibration, warnings.append)
@@ -353,14 +353,17 @@ def _clips_of(
             )
         taken[stem] = camera
     with ThreadPoolExecutor(os.cpu_count()) as threads:
-        clips = tuple(threads.map(lambda stem: probe(found[stem], is_mask), taken))
-    for clip, camera in zip(clips, taken.values(), strict=True):
-        if (clip.width, clip.height) != (camera.width, camera.height):
+        clips = list(threads.map(lambda stem: probe(found[stem], is_mask), taken))
+    for k, (clip, camera) in enumerate(zip(clips, taken.values(), strict=True)):
+        size = camera.width, camera.height
+        if isinstance(clip, VideoClip) and clip.turn % 180 and (clip.height, clip.width) == size != size[::-1]:
+            clips[k] = clip.unturned()
+        elif (clip.width, clip.height) != size:
             raise VideoError(
                 f"{clip.path}: is {clip.width}×{clip.height}, but {calibration.path.name} gives camera {camera.name!r} "
                 f"{camera.width}×{camera.height}; calibrate for this size or scale the pictures"
             )
-    return clips
+    return tuple(clips)
 
 
 def _common_length(clips: Sequence[Clip], late: Sequence[int], warn: Callable[[str], None]) -> int:
