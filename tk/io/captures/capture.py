@@ -17,7 +17,7 @@ from tk.errors import CaptureError, VideoError, VolumeError
 from tk.io.captures.calibration import Calibration, match_camera, read_calibration
 from tk.io.captures.capture_toml import CaptureSettings, GivenSubject, read_settings
 from tk.io.captures.clip import Clip, Image
-from tk.io.captures.clip_folder import list_clips, probe
+from tk.io.captures.clip_folder import list_clips, names_in, probe
 from tk.io.captures.frames import FrameReader, FrameSet
 from tk.io.captures.mobo import SETTINGS as MOBO_SETTINGS
 from tk.io.captures.mobo import find_walk, read_cameras
@@ -345,8 +345,9 @@ def _clips_of(
             raise VideoError(f"{folder}: {ambiguous}") from None
         if stem is None:
             expected = folder / (camera.name if folder.name == "images" else f"{camera.name}.{suffix}")
-            there = ", ".join(file.name for file in found.values()) or "nothing"
-            raise VideoError(f"{expected}: camera {camera.name!r} has no {what}; {folder.name}/ holds {there}")
+            raise VideoError(
+                f"{expected}: camera {camera.name!r} has no {what}; {folder.name}/ holds {names_in(folder)}"
+            )
         if stem in taken:
             raise VideoError(
                 f"{found[stem]}: fits both cameras {taken[stem].name!r} and {camera.name!r}; rename it to its camera"

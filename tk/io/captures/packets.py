@@ -152,7 +152,8 @@ def read_contents(path: Path) -> Contents:
         promised, duration_s = _promised(container, stream)
         tick = float(stream.time_base)
     times = np.sort([packet.time for packet in packets if packet.time is not None and not packet.discarded])
-    ends_s = tick * float(times[-1] - times[0]) if len(times) else 0.0
+    # durations in headers begin with 0 or with the first image
+    ends_s = tick * float(max(times[-1], times[-1] - times[0])) if len(times) else 0.0
     shown = sum(not packet.discarded for packet in packets)
     if shown < len(packets):
         promised = 0  # the index was read completely

@@ -21,8 +21,8 @@ from tk.io.captures.packets import REORDERED, Contents, as_bgr, decoded, open_vi
 from tk.io.paths import c_name
 
 VIDEO_SUFFIXES = (
-    *(".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mts", ".m2ts", ".ts"),
-    *(".webm", ".wmv", ".mpg", ".mpeg", ".3gp"),
+    *(".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv", ".3gp"),
+    *(".3g2", ".asf", ".dv", ".flv", ".mxf", ".ogv", ".vob"),
 )
 
 _PLANAR = ("yuv420p", "yuvj420p")  # see VideoClip.planar
