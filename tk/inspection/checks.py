@@ -45,7 +45,7 @@ Masks = NDArray[np.uint8]
 # treadmill-slow (half the value names two cameras more, twice the value one fewer).
 #: frames that are compared; frames whose neighbours, LARGEST_DELAY before and after, are also compared
 _FRAMES, _DELAY_FRAMES = 10, 5
-#: frames from the start of the capture that are read: videos are decoded in order, so later frames take longer
+#: frames from the first one that all cameras have that are read: videos are decoded in order, so later frames take longer
 _SPAN = 600
 #: a video is delayed if shifting it reduces the share of its masks outside the hull to less than this share of itself,
 #: and that share without a shift is larger than the second value
@@ -179,11 +179,13 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
     Raises:
         CaptureError: the capture cannot be read.
     """
-    span = min(capture.frame_count, _SPAN)
-    frames = np.unique(np.linspace(0, span - 1, _FRAMES).round().astype(int))
-    last = max(span - 1 - LARGEST_DELAY, span // 4)
-    centers = np.unique(np.linspace(span // 4, last, _DELAY_FRAMES).round().astype(int)).tolist()
-    near = {i + s for i in centers for s in range(-LARGEST_DELAY, LARGEST_DELAY + 1)} & set(range(span))
+    first = capture.first_frame  # before it, a camera that begins later shows its first image
+    span = range(first, min(capture.frame_count, first + _SPAN))
+    frames = np.unique(np.linspace(first, span[-1], _FRAMES).round().astype(int))
+    quarter = first + len(span) // 4
+    last = max(span[-1] - LARGEST_DELAY, quarter)
+    centers = np.unique(np.linspace(quarter, last, _DELAY_FRAMES).round().astype(int)).tolist()
+    near = {i + s for i in centers for s in range(-LARGEST_DELAY, LARGEST_DELAY + 1)} & set(span)
     kept = frames[np.linspace(0, len(frames) - 1, min(pictures, len(frames))).round().astype(int)]
     read = _read(capture, config, span, near | set(frames.tolist()), set(kept.tolist()))
     notes, small, masks = read.notes, read.small, read.masks
@@ -259,14 +261,14 @@ class _Read:
     notes: list[str]
 
 
-def _read(capture: Capture, config: Settings, span: int, compared: set[int], kept: set[int]) -> _Read:
-    """Decode and segment the first ``span`` frames; return the masks of the frames that are ``compared``, and the
+def _read(capture: Capture, config: Settings, span: range, compared: set[int], kept: set[int]) -> _Read:
+    """Decode and segment the frames of ``span``; return the masks of the frames that are ``compared``, and the
     images of those that are ``kept``."""
     notes = list(capture.warnings)
     label = make_labeller(Task.of(capture, config), notes.append)
     read = _Read({}, {}, {}, tuple({} for _ in capture.rig), PeopleWatch(capture, span), notes)
     health = ImageHealth()
-    with capture.frames(0, span) as reader:
+    with capture.frames(span.start, span.stop) as reader:
         for frame in reader:
             i, watched = frame.index, read.watch.wants(frame.index)
             if not watched and i not in compared:

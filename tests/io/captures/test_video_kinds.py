@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from tests.conftest import refused
-from tests.io.conftest import HEIGHT, WIDTH, MakeCapture, picture, read_tag, write_toml
+from tests.io.conftest import HEIGHT, WIDTH, MakeCapture, picture, read_tag
 from tk.errors import VideoError
 from tk.io.captures import video
 from tk.io.captures.capture import open_capture
 from tk.io.captures.clip import Clip
 from tk.io.captures.packets import read_contents
-from tk.io.captures.video import VideoClip, probe_video
+from tk.io.captures.video import probe_video
 
 CODECS = {".wmv": "wmv2", ".mpg": "mpeg2video", ".webm": "libvpx"}
 INTERLACED = {"flags": "+ilme+ildct", "x264-params": "tff=1"}

@@ -266,7 +266,7 @@ def open_capture(
     if settings.unknown:
         warnings.append(f"{path / 'capture.toml'}: unknown keys are ignored: {', '.join(settings.unknown)}")
     _warn_of_units(calibration, warnings.append)
-    stamps = read_stamps(path, calibration, clips)
+    stamps = read_stamps(path, calibration, clips, settings.fps if settings.times == "fps" else None)
     if resample:
         clips, mask_clips, fps = resampled(clips, mask_clips, stamps, settings.fps, warnings.append)
     else:

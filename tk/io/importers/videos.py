@@ -246,8 +246,8 @@ def _one_recording(
     of_trial = f" of the trial {trial!r}" if trial else ""
     there = _some(path.name for path in _listed(root)) or "nothing"
     raise VideoError(
-        f"{root}: holds no videos{of_trial} of two cameras; searched in {', '.join(searched)}; the folder holds {there}; "
-        f"tk reads {', '.join(VIDEO_SUFFIXES)}"
+        f"{root}: holds no videos{of_trial} of two cameras; searched in {', '.join(searched)}; the folder holds "
+        f"{there}; tk reads {', '.join(VIDEO_SUFFIXES)}"
     )
 
 
