@@ -21,6 +21,7 @@ from tk.evaluation.joints import plain_values
 from tk.inspection.leveling import Leveling, find_up
 from tk.inspection.people import PeopleWatch, PersonReport, many_people
 from tk.io.captures.capture import Capture
+from tk.io.captures.video import odd_turn
 from tk.kernels.mask_values import PERSON
 from tk.model.body.plausibility import fits_height
 from tk.model.cameras.common_view import sample_box, views_of
@@ -237,7 +238,9 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
         for i in kept.tolist()
     ]
     moved = [line for i in kept[:1] for line in _moved_since_empty(capture, read.images[int(i)], masks[int(i)])]
-    findings = [*moved, *_findings(inspection, capture, agreement), *many_people(people, entered)]
+    findings = [*moved, *_findings(inspection, capture, agreement)]
+    if not agreement.wrong:  # a wrong camera makes one person look like several
+        findings += many_people(people, entered)
     return replace(inspection, findings=tuple([unrelated, *findings] if unrelated else findings)), seen
 
 
@@ -391,7 +394,8 @@ def _camera(
             f"{max(late, 0)} of the others shows"
         )
     elif c in agreement.wrong:
-        verdict = agreement.reason(c)
+        turn = odd_turn(capture.clips[c], capture.clips)
+        verdict = agreement.reason(c) + (f"; {turn}" if turn else "")
     return CameraReport(
         name=camera.name,
         area=float(np.mean([m.mean() for m in own])),

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import shutil
+import struct
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from fractions import Fraction
@@ -37,6 +40,8 @@ def write(
     keep: Callable[[int, Any], bool] | None = None,
     shift: int = 0,
     sound_s: float = 0.0,
+    turn: int = 0,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
 ) -> Path:
     """Write a video of :func:`picture`, coded by PyAV.
 
@@ -45,11 +50,13 @@ def write(
         keep: whether the packet with a number is written.
         shift: frames by which all times are earlier; MP4 gets an edit list that excludes what lies before 0.
         sound_s: duration of a track of sound.
+        turn: degrees, counter-clockwise, by which the file asks players to turn its images.
+        size: of the images as they are coded.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
         stream: Any = container.add_stream(codec, rate=fps, options={"crf": "10"} | (options or {}))
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        (stream.width, stream.height), stream.pix_fmt = size, "yuv420p"
         if codec == "mpeg2video":
             stream.codec_context.max_b_frames, stream.codec_context.bit_rate = 2, 2_000_000
         if times:
@@ -57,7 +64,7 @@ def write(
         sound: Any = container.add_stream("aac", rate=8000, layout="mono") if sound_s else None
         packets = []
         for place, number in enumerate(numbers):
-            frame = av.VideoFrame.from_ndarray(picture(camera, number), format="bgr24")
+            frame = av.VideoFrame.from_ndarray(picture(camera, number, size), format="bgr24")
             if times:
                 frame.pts, frame.time_base = round(1000 * times(place)), Fraction(1, 1000)
             packets += stream.encode(frame)
@@ -73,6 +80,12 @@ def write(
             quiet.rate = 8000
             for packet in [*sound.encode(quiet), *sound.encode(None)]:
                 container.mux(packet)
+    if turn:  # the matrix in the header of the track
+        one, cos, sin = 1 << 16, round(np.cos(np.radians(turn))), round(np.sin(np.radians(turn)))
+        before = struct.pack(">9i", one, 0, 0, 0, one, 0, 0, 0, 1 << 30)
+        after = struct.pack(">9i", cos * one, -sin * one, 0, sin * one, cos * one, 0, 0, 0, 1 << 30)
+        head, track, rest = path.read_bytes().partition(b"tkhd")
+        path.write_bytes(head + track + rest.replace(before, after, 1))
     return path
 
 
@@ -195,3 +208,44 @@ def test_the_message_about_a_missing_video_lists_the_folder(make_capture: MakeCa
     (folder / "videos" / "cam2.mp4").rename(folder / "videos" / "cam2.r3d")
     with refused(VideoError, folder / "videos" / "cam2.mp4", "'cam2' has no video", "cam1.mp4, cam2.r3d, cam3.mp4"):
         open_capture(folder)
+
+
+@pytest.mark.parametrize("turn", [90, 180, 270])
+def test_images_are_turned_as_the_file_asks(tmp_path: Path, turn: int) -> None:
+    path = write(tmp_path / "a.mp4", range(6), turn=turn, camera=2)
+    clip = probe_video(path)
+    size = (HEIGHT, WIDTH) if turn % 180 else (WIDTH, HEIGHT)
+    assert (clip.width, clip.height, clip.turn, clip.by_opencv) == (*size, turn, True)
+    out = np.zeros((clip.height, clip.width, 3), np.uint8)
+    for each in (clip, dataclasses.replace(clip, by_opencv=False)):
+        with closing(each.open()) as reader:
+            reader.skip()
+            reader.read(out)
+        assert read_tag(np.rot90(out, -turn // 90)) == (2, 1)
+    assert tags(clip.unturned()) == list(range(6))
+
+
+def test_a_turn_that_contradicts_the_calibrated_size_is_left_out(make_capture: MakeCapture) -> None:
+    folder = make_capture(cameras=4)
+    path = write(folder / "videos" / "cam2.mp4", range(12), fps=15, camera=1, turn=90)
+    write(folder / "background" / "cam2.mp4", range(12), fps=15, camera=1, turn=90)
+    for name in ("cam1", "cam3", "cam4"):
+        shutil.copy(folder / "videos" / f"{name}.mp4", folder / "background" / f"{name}.mp4")
+    capture = open_capture(folder)
+    assert any(str(path) in line and "turn by 90°" in line for line in capture.warnings)
+    with capture.frames() as frames:
+        assert read_tag(next(frames).images[1]) == (1, 0)
+    empty = capture.background()
+    assert empty is not None and read_tag(empty[1][0]) == (1, 0)
+
+
+def test_a_doubted_camera_whose_file_alone_asks_for_a_turn_is_named_with_it(make_capture: MakeCapture) -> None:
+    folder = make_capture(cameras=4)
+    path = write(folder / "videos" / "cam3.mp4", range(12), fps=15, camera=2, turn=180)
+    capture = open_capture(folder)
+    (line,) = capture.damaged(12, np.array([True, True, True, True]))
+    assert line.startswith(f"{path}: ") and "180°" in line
+    assert capture.damaged(12, np.array([True, True, False, True])) == []
+    for camera in (1, 2, 4):
+        write(folder / "videos" / f"cam{camera}.mp4", range(12), fps=15, camera=camera - 1, turn=180)
+    assert open_capture(folder).damaged(12, np.ones(4, bool)) == []  # the calibration is of turned images

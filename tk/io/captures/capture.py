@@ -24,7 +24,7 @@ from tk.io.captures.mobo import find_walk, read_cameras
 from tk.io.captures.pictures import PictureClip, picture_number
 from tk.io.captures.timing import check_clock, read_stamps
 from tk.io.captures.timing import resample as resampled
-from tk.io.captures.video import VideoClip, damaged_images, notes_on
+from tk.io.captures.video import VideoClip, damaged_images, notes_on, odd_turn
 from tk.io.paths import text_of
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import infer_volume, sample_box, views_of
@@ -168,13 +168,15 @@ class Capture:
 
     def damaged(self, stop: int, cameras: NDArray[np.bool_]) -> list[str]:
         """Return a line on each video of some cameras, (C,) bool, with images before frame ``stop`` that cannot be
-        decoded completely."""
+        decoded completely, or with another turn than most of the others."""
         lines = []
         for camera in np.flatnonzero(cameras).tolist():
             clip, late = self.clips[camera], self.late_frames[camera]
             if isinstance(clip, VideoClip) and (bad := damaged_images(clip, min(stop - late, _CHECKED_IMAGES))):
                 which = described(bad[0] + late, bad[-1] + late, len(bad))
                 lines.append(f"{clip.path}: is damaged in {which}; copy it again, or re-encode the original")
+            if turn := odd_turn(clip, self.clips):
+                lines.append(f"{clip.path}: {turn}")
         return lines
 
     @property

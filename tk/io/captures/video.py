@@ -113,6 +113,15 @@ def notes_on(clips: Sequence[Clip]) -> list[str]:
     return lines
 
 
+def odd_turn(clip: Clip, clips: Sequence[Clip]) -> str:
+    """Return in words by how much the file of a clip asks for a turn, if most of the other clips ask for another."""
+    turns = [each.turn for each in clips if isinstance(each, VideoClip)]
+    if not isinstance(clip, VideoClip) or 2 * turns.count(clip.turn) >= len(turns):
+        return ""
+    asks = f"asks players to turn its images by {clip.turn}°" if clip.turn else "asks for no turn of its images"
+    return f"its file {asks}, unlike most of the others: the calibration may be of images without this turn"
+
+
 def damaged_images(clip: VideoClip, stop: int) -> list[int]:
     """Return the images of a video before ``stop`` that FFmpeg cannot decode unless it repairs them, which it does
     without an error, so that no reader notices."""
