@@ -46,7 +46,8 @@ Masks = NDArray[np.uint8]
 # treadmill-slow (half the value names two cameras more, twice the value one fewer).
 #: frames that are compared; frames whose neighbours, LARGEST_DELAY before and after, are also compared
 _FRAMES, _DELAY_FRAMES = 10, 5
-#: frames from the first one that all cameras have that are read: videos are decoded in order, so later frames take longer
+#: frames that are read, from the first one that all cameras have: videos are decoded in order, so later frames take
+#: longer
 _SPAN = 600
 #: a video is delayed if shifting it reduces the share of its masks outside the hull to less than this share of itself,
 #: and that share without a shift is larger than the second value

@@ -20,8 +20,8 @@ _SHOWN = 0.5
 
 
 def really_there(
-    finder: PeopleFinder, setup: Setup, opening: Sequence[Observation], found: Sequence[LocatedPerson]
-) -> Sequence[LocatedPerson]:
+    finder: PeopleFinder, setup: Setup, opening: Sequence[Observation], found: tuple[LocatedPerson, ...]
+) -> tuple[LocatedPerson, ...]:
     """Return the people in the first frame of an opening: those just ``found`` in all cameras, or one.
 
     It is one if the cameras without those that contradict them show one, whom the contradicting ones do not show. A

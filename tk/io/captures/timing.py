@@ -188,7 +188,8 @@ def resample(
     The rate is ``fps``, else that of the slowest camera. A frame without an image within half an interval is blank.
 
     Raises:
-        CaptureError: the times of a clip are unknown, the cameras have no time in common, or none is as fast as ``fps``.
+        CaptureError: the times of a clip are unknown, the cameras have no time in common, or ``fps`` is above the rate
+            of each.
     """
     known: list[Stamps] = []
     for clip, each in zip(clips, stamps, strict=True):
