@@ -24,7 +24,7 @@ from tk.io.captures.mobo import find_walk, read_cameras
 from tk.io.captures.pictures import PictureClip, picture_number
 from tk.io.captures.timing import check_clock, read_stamps
 from tk.io.captures.timing import resample as resampled
-from tk.io.captures.video import VideoClip, damaged_images, notes_on, odd_turn
+from tk.io.captures.video import VideoClip, as_calibrated, damaged_images, notes_on, odd_turn
 from tk.io.paths import text_of
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import infer_volume, sample_box, views_of
@@ -359,9 +359,8 @@ def _clips_of(
         clips = list(threads.map(lambda stem: probe(found[stem], is_mask), taken))
     for k, (clip, camera) in enumerate(zip(clips, taken.values(), strict=True)):
         size = camera.width, camera.height
-        if isinstance(clip, VideoClip) and clip.turn % 180 and (clip.height, clip.width) == size != size[::-1]:
-            clips[k] = clip.unturned()
-        elif (clip.width, clip.height) != size:
+        clip = clips[k] = as_calibrated(clip, size)
+        if (clip.width, clip.height) != size:
             raise VideoError(
                 f"{clip.path}: is {clip.width}×{clip.height}, but {calibration.path.name} gives camera {camera.name!r} "
                 f"{camera.width}×{camera.height}; calibrate for this size or scale the pictures"

@@ -95,6 +95,13 @@ def probe_video(path: Path, is_mask: bool = False) -> VideoClip:
     )
 
 
+def as_calibrated(clip: Clip, size: tuple[int, int]) -> Clip:
+    """Return a clip without the turn that its file asks for, if only then it has the size of the calibration."""
+    if isinstance(clip, VideoClip) and clip.turn % 180 and (clip.height, clip.width) == size != size[::-1]:
+        return clip.unturned()
+    return clip
+
+
 def notes_on(clips: Sequence[Clip]) -> list[str]:
     """Return lines about videos that the user should know of: interlaced ones, and ones that are not turned."""
     lines = []

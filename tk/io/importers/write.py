@@ -18,6 +18,7 @@ from tk.io.captures.calibration import camera_table
 from tk.io.captures.capture import open_capture
 from tk.io.captures.clip_folder import probe
 from tk.io.captures.pictures import PICTURE_SUFFIXES
+from tk.io.captures.video import as_calibrated
 from tk.io.importers.project import Project
 from tk.io.paths import replacing, text_of
 from tk.model.cameras.camera import Camera, Rig
@@ -169,7 +170,7 @@ def _renamed(rig: Rig, notes: list[str]) -> Rig:
 def _fitted(rig: Rig, clips: Sequence[Path], notes: list[str]) -> Rig:
     cameras = []
     for camera, clip in zip(rig, clips, strict=True):
-        found = probe(clip)
+        found = as_calibrated(probe(clip), (camera.width, camera.height))
         fitted, note = fit_size(camera, found.width, found.height, clip)
         if note:
             notes.append(note)
