@@ -26,7 +26,8 @@ from tk.io.results.reader import read_result
 
 __all__ = ["FORMATS", "Exported", "Motion", "export", "read_motion"]
 
-Writer = Callable[[Motion, Path], None]
+# writes a file or a folder, and returns a note for the user if the format cannot hold all of the motion
+Writer = Callable[[Motion, Path], str | None]
 
 
 @dataclass(frozen=True)
@@ -107,8 +108,9 @@ def export(
     for person, name, target, write in jobs:
         if name not in failed and person.person in motions:
             try:
-                _write(motions[person.person], target, write)
+                note = _write(motions[person.person], target, write)
                 written.append(target)
+                notes += [f"{target}: {note}"] if note else []
             except TkError as error:
                 failed[name] = str(error)
                 refused.append(error)
@@ -165,13 +167,14 @@ def _number(person: Result, people: Sequence[Result]) -> str:
     return f"_{person.person}" if len(people) > 1 else ""
 
 
-def _write(motion: Motion, target: Path, write: Writer) -> None:
-    """Write to a temporary file and rename it, so that a file with the final name is complete."""
+def _write(motion: Motion, target: Path, write: Writer) -> str | None:
+    """Write to a temporary file and rename it, so that a file with the final name is complete; return the note."""
     with replacing(target) as part:
         target.parent.mkdir(parents=True, exist_ok=True)
-        write(motion, part)
+        note = write(motion, part)
         if target.is_dir():  # a rename does not replace a folder
             _remove(target)
+    return note
 
 
 def _remove(folder: Path) -> None:
