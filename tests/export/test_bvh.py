@@ -105,7 +105,9 @@ def test_segment_whose_length_varies_is_reported(write: Write) -> None:
 
     path = write(rows=rows)
     target, note = export(path, ["bvh"]).files[0], export(path, ["bvh"], force=True).notes[-1]
-    assert note == f"{target}: joints are up to 7.8 cm off: the segments' lengths vary, and the format holds one of each"
+    assert (
+        note == f"{target}: joints are up to 7.8 cm off: the segments' lengths vary, and the format holds one of each"
+    )
 
 
 def test_another_axis_up(write: Write) -> None:

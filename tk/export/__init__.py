@@ -8,7 +8,6 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 
 from tk.errors import ExportError, ResultError, TkError
@@ -38,13 +37,12 @@ class Format:
     outputs: tuple[tuple[str, Writer], ...]
     begins: bytes | None = None  # regular expression for the begin of its files; None for a folder
     holds: bool = False  # True if it cannot mark a pose as unknown
-    package: str = ""  # a package that it needs beyond those of tk itself
 
 
 FORMATS = {
     "trc": Format(((".trc", write_trc),), rb"PathFileType\t"),
     "mot": Format(((".mot", write_mot),), rb"[^\n]*\nversion=1\n"),
-    "c3d": Format(((".c3d", write_c3d),), rb".P", package="ezc3d"),
+    "c3d": Format(((".c3d", write_c3d),), rb".P"),
     "bvh": Format(((".bvh", write_bvh),), rb"HIERARCHY", holds=True),
     "csv": Format(((".csv", write_points_csv), ("_angles.csv", write_angles_csv)), rb"frame,time,status,"),
     "gltf": Format(((".glb", write_glb),), rb"glTF", holds=True),
@@ -85,11 +83,6 @@ def export(
         ExportError: a format is unknown, a file exists, or none of the formats can be written.
     """
     chosen = _chosen(formats, bvh_units)
-    failed = {
-        name: f"needs the package {form.package}: pip install 'tk-mocap[export]'"
-        for name, form in chosen.items()
-        if form.package and find_spec(form.package) is None
-    }
     path = Path(result)
     folder = path.parent if folder is None else folder
     people = read_result(path).people
@@ -97,14 +90,13 @@ def export(
         (person, name, folder / f"{path.stem}{_number(person, people)}{smoothed * '_smoothed'}{ending}", write)
         for person in people
         for name, form in chosen.items()
-        if name not in failed
         for ending, write in form.outputs
     ]
     capture = next((each for each in resolved(folder).parents if (each / "calibration.toml").is_file()), None)
     for _, name, target, _ in jobs:
         _check_target(target, FORMATS[name], path, force, capture)
     motions, notes = _motions(people, smoothed, ", ".join(name for name, form in chosen.items() if form.holds))
-    written, refused = list[Path](), list[TkError]()
+    written, failed, refused = list[Path](), dict[str, str](), list[TkError]()
     for person, name, target, write in jobs:
         if name not in failed and person.person in motions:
             try:
