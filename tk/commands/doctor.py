@@ -182,7 +182,6 @@ CHECKS: dict[str, Callable[[], str]] = {
     "cores": _cores,
     "memory": _memory,
     "segmenter": _segmenter,
-    "ezc3d": _extra("ezc3d", "tk export --to c3d", "export"),
     "Dask": _extra("distributed", "tk batch", "cluster"),
     "pandas": _extra("pandas", "tables of a result", "tables"),
     "xarray": _extra("xarray", "tables of a result", "tables"),

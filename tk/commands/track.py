@@ -27,12 +27,16 @@ WARN_SHARE = 0.2
 
 @click.command(
     epilog=base.example(
+        "tk track CAPTURE",
         "tk track CAPTURE -o result.h5",
         "tk track CAPTURE -o part.h5 --frames 0:100 --cameras cam1,cam2,cam4",
     )
 )
 @base.capture_argument
-@click.option("-o", "--output", required=True, type=base.PATH, metavar="RESULT.h5")
+@click.option(
+    "-o", "--output", type=base.PATH, metavar="RESULT.h5",
+    help="The result.  [default: the name of CAPTURE's folder, in the current folder]",
+)  # fmt: skip
 @base.tracking_options
 @click.option(
     "--init-pose", type=base.PATH, metavar="FILE",
@@ -45,7 +49,7 @@ WARN_SHARE = 0.2
 @base.json_option
 def track(
     capture: Path,
-    output: Path,
+    output: Path | None,
     resume: bool,
     force: bool,
     no_report: bool,
@@ -58,6 +62,9 @@ def track(
 
     An overlay video (RESULT.mp4) and a report (RESULT.html) are written next to it.
     """
+    if output is None:
+        output = Path(f"{capture.resolve().name}.h5")
+        base.print_lines("note: the result is ", [output.absolute()])
     reporter = ConsoleReporter(quiet, None, *later_stages(causal, no_report), "loading")
     with reporter, started_early():
         from tk.io.importers import open_recording

@@ -115,6 +115,7 @@ def _person(result: Result, figure: Figure, stage: Stage, truth: dict[str, Any] 
         "truth": truth,
         "objective": packed(result.objective),
         "angles": _angles(result, figure),
+        "unmeasured": [f"{joint.joint} {joint.unmeasured}" for joint in result.meta.angles if joint.unmeasured],
         "timing": _timing(result),
     }
 
@@ -151,18 +152,24 @@ def _scene(stage: Stage, rig: Rig | None) -> dict[str, Any]:
 
 
 def _angles(result: Result, figure: Figure) -> list[dict[str, Any]]:
-    """Return a panel per angle, with both sides in one. Flexion of elbows and knees has a standard deviation."""
+    """Return a panel per angle, with both sides in one. Flexion of elbows and knees has a standard deviation.
+
+    An angle that is NaN in every frame has no panel; the page gives `JointAngles.unmeasured` instead.
+    """
     panels: dict[str, dict[str, Any]] = {}
     for joint in result.meta.angles:
         side = joint.joint[-2:] if joint.joint.endswith(("_l", "_r")) else ""
         base = joint.joint.removesuffix(side)
         for column, name in enumerate(joint.names):
+            values = result.angles[joint.joint][:, column]
+            if joint.unmeasured and np.isnan(values).all():
+                continue
             title = f"{base} {name}".replace("_", " ")
             panel = panels.setdefault(
                 title, {"title": title[0].upper() + title[1:], "convention": joint.convention, "lines": []}
             )
             line: dict[str, Any] = {"side": {"_l": "left", "_r": "right", "": "middle"}[side]}
-            line |= {"values": packed(result.angles[joint.joint][:, column])}
+            line |= {"values": packed(values)}
             if name == "flexion" and joint.joint in HINGES and figure.sigma is not None:
                 line |= {
                     "sigma": packed(

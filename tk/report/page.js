@@ -257,7 +257,8 @@
     if (person.angles.length) {
       const banded = person.angles.some(({ lines }) => lines.some((line) => line.sigma));
       get("angles-text", n).textContent = "Degrees. Left warm, right cool. Point at a title to read its convention (ISB where it defines one). "
-        + (banded ? "Bands: ± one σ, computed from independent positions of the three joints; other angles have no σ." : "No σ is available.");
+        + (banded ? "Bands: ± one σ, computed from independent positions of the three joints; other angles have no σ." : "No σ is available.")
+        + person.unmeasured.map((text) => ` Not measured: ${text.replaceAll("_", " ")}.`).join("");
       for (const panel of person.angles) {
         charts.push(new Chart(get("angle-charts", n), {
           ...common, title: panel.title, unit: "°", hint: panel.convention, wraps: true, least: 20, digits: 1,

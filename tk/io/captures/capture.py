@@ -29,7 +29,7 @@ from tk.io.paths import text_of
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import infer_volume, sample_box, views_of
 from tk.model.cameras.mounting import infer_up
-from tk.model.cameras.up import up_vector
+from tk.model.cameras.up import shown_up, up_vector
 from tk.model.cameras.volume import Volume
 from tk.model.masks.image_health import described
 from tk.model.setup import Setup, Subject
@@ -62,7 +62,7 @@ DEFAULT_UP, _UP_DEG = "z", 25.0
 _FAR_APART_M = 100.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Capture:
     """An open capture folder, a :class:`~tk.io.captures.source.Source`. :meth:`frames` reads its images.
 
@@ -106,6 +106,23 @@ class Capture:
     time_offset_s: tuple[float, ...]
     segmenter: Segmenter | None = None
     subjects: tuple[GivenSubject, ...] = (GivenSubject(),)
+
+    def __repr__(self) -> str:
+        """Return folder, cameras, frames and masks, in four lines."""
+        by_size: dict[str, list[str]] = {}
+        for camera in self.rig:
+            by_size.setdefault(f"{camera.width}×{camera.height}", []).append(camera.name)
+        cameras = "; ".join(f"{', '.join(names)} ({size})" for size, names in by_size.items())
+        made = {"none": "against the empty scene in background", "median": "against the median image", "": "not given"}
+        masks = made.get(self.masks_from, f"from {self.masks_from}")
+        count = self.frame_count - self.first_frame
+        return (
+            f"Capture {self.name}: {self.path}\n"
+            f"{len(self.rig)} cameras: {cameras}\n"
+            f"{count} frames, {self.first_frame} to {self.frame_count - 1}, {count / self.fps:.1f} s at "
+            f"{self.fps:g} frames/s\n"
+            f"masks: {masks}; up: {shown_up(self.up)}"
+        )
 
     @property
     def late_frames(self) -> tuple[int, ...]:
@@ -395,7 +412,7 @@ def _up(settings: CaptureSettings, rig: Rig, path: Path, warn: Callable[[str], N
     found = infer_up(rig)
     if up_vector(found.up) @ up_vector(DEFAULT_UP) > np.cos(np.radians(_UP_DEG)):
         return DEFAULT_UP
-    warn(f"{path / 'capture.toml'}: gives no up; {found.up} is taken, {found.how}; tk level looks closer")
+    warn(f"{path / 'capture.toml'}: gives no up; {shown_up(found.up)} is taken, {found.how}; tk level looks closer")
     return found.up
 
 

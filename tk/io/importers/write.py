@@ -24,7 +24,7 @@ from tk.io.paths import replacing, text_of
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import closest_to_axes, common_boxes
 from tk.model.cameras.mounting import FoundUp, infer_up
-from tk.model.cameras.up import up_text
+from tk.model.cameras.up import shown_up, up_text
 from tk.model.cameras.volume import Volume
 
 #: least side of a working volume, metres: a person with arms spread needs more
@@ -56,7 +56,7 @@ def write_capture(project: Project, output: Path) -> Imported:
     rig = _fitted(_renamed(project.rig, notes), project.clips, notes)
     found = FoundUp(project.up, f"as {project.tool} defines it") if project.up else infer_up(rig)
     volume, where = find_volume(rig)
-    notes.append(f"up = {_up_toml(found.up)}: {found.how}")
+    notes.append(f"up = {shown_up(found.up)}: {found.how}")
     if volume is None:
         notes.append(where)
     else:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ from tk.io.results.schema import ROWS as DATASETS
 from tk.io.results.schema import columns_of
 from tk.io.results.status import Status, has_pose
 from tk.io.toml import parse_toml
+from tk.model.body.angles import ANGLES, UNMEASURED
 from tk.model.body.anthropometry import AVERAGE_BODY
 from tk.model.body.joints import JOINTS, ROWS, in_joint_order
 from tk.model.body.skeleton import paper_poses, skeleton_of_names
@@ -37,6 +38,20 @@ class JointAngles:
     joint: str  # name of the dataset, such as `knee_l`
     names: tuple[str, ...]  # names of the angles, such as `flexion`
     convention: str  # zero position and positive direction, in words
+    unmeasured: str = ""  # angles that are NaN in every frame, with the reason
+
+    @classmethod
+    def of_body(cls, pose_names: Sequence[str]) -> tuple[JointAngles, ...]:
+        """Return all joints, of a body with these degrees of freedom."""
+        return tuple(
+            cls(
+                angles.joint,
+                angles.names,
+                angles.convention,
+                f"{', '.join(missing)}: {UNMEASURED}" if (missing := angles.unmeasured(pose_names)) else "",
+            )
+            for angles in ANGLES
+        )
 
     def __post_init__(self) -> None:
         if not self.joint or "/" in self.joint or not self.names:
