@@ -67,6 +67,8 @@ class CameraReport:
         empty, cut: shares of the frames without a person, and with a person at the edge of the image.
         outside: share of its masks outside the hull of the other cameras.
         shift_px: smallest shift that moves its masks into that hull, pixels; NaN if none does.
+        pairs_px: error of its outlines in pairs with the others that are not wrong, median, pixels; NaN if no pair can
+            be tested.
         late_frames: frames by which its video starts late: its frame k shows what frame k + late of the others shows.
         bad_images: number of frames whose image is blank, frozen or moved.
         verdict: what is wrong, in words; empty if nothing is.
@@ -80,6 +82,7 @@ class CameraReport:
     cut: float
     outside: float
     shift_px: float
+    pairs_px: float
     late_frames: int
     bad_images: int
     verdict: str
@@ -126,14 +129,14 @@ class Inspection:
             f"{self.with_hull:.0%} of them have a visual hull; length of the person {self.extent_m:.2f} m",
             "",
             f"{'camera':12} {'mask':>6} {'specks':>7} {'holes':>6} {'empty':>6} {'cut':>5} {'outside':>8} "
-            f"{'shift':>9} {'late':>5}",
+            f"{'shift':>7} {'pairs':>7} {'late':>5}",
         ]
         for c in self.cameras:
-            shift = f"{c.shift_px:.0f} px" if np.isfinite(c.shift_px) else "?"
+            shift, pairs = (f"{px:.0f} px" if np.isfinite(px) else "?" for px in (c.shift_px, c.pairs_px))
             outside = f"{c.outside:.1%}" if np.isfinite(c.outside) else "-"
             lines.append(
                 f"{c.name:12} {c.area:6.1%} {c.specks:7.1%} {c.holes:6.1%} {c.empty:6.0%} {c.cut:5.0%} {outside:>8} "
-                f"{shift:>9} {c.late_frames:5d}"
+                f"{shift:>7} {pairs:>7} {c.late_frames:5d}"
             )
         lines += [
             "",
@@ -399,6 +402,7 @@ def _camera(
         cut=cut / len(own),
         outside=float(agreement.outside[c]),
         shift_px=float(np.hypot(*agreement.shift_px[c])),
+        pairs_px=float(agreement.pairs_px[c]),
         late_frames=late,
         bad_images=len(bad_images),
         verdict=verdict,
