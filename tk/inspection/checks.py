@@ -301,7 +301,7 @@ def _delays(
     compare: MaskAgreement, masks: dict[int, Masks], centers: Sequence[int], agreement: Agreement
 ) -> tuple[NDArray[np.int64], bool]:
     """Return the delay of each camera (C,) frames, the shift with which its masks lie in the hull of the others; and
-    whether it is certain: the same without any one of the frames (jackknife)."""
+    whether it is certain, see :func:`best_shift`."""
     C = len(compare.rig)
     small = {index: compare.small(m) for index, m in masks.items()}
     hulls = compare.hulls([compare.possible(masks[i]) for i in centers])
@@ -311,22 +311,34 @@ def _delays(
         best_shift(*_areas_by_shift(small, centers, hulls, [k for k in agreement.right if k != c], c, shifts))
         for c in range(C)
     ]
-    # a delayed camera also spoils the hulls for the others; the delayed one gains most from a shift
-    c = int(np.argmax([gain for _, gain, _ in found]))
+    # a delayed camera also spoils the hulls for the others, which then gain from a shift, too; only the shift of the
+    # delayed one makes all cameras agree
+    candidates = [c for c, (shift, *_) in enumerate(found) if shift]
+    if not candidates:
+        return late, True
+
+    def outside(c: int) -> float:
+        pairs = [(masks[i], masks[i + found[c][0]]) for i in centers if i + found[c][0] in masks]
+        this = np.arange(C)[:, None, None] == c
+        return compare.mean_outside([np.where(this, shifted, now) for now, shifted in pairs], agreement.right)
+
+    c = min(candidates, key=outside)
     late[c] = -found[c][0]
     return late, found[c][2]
 
 
 def best_shift(outside: NDArray[np.float64], area: NDArray[np.float64]) -> tuple[int, float, bool]:
     """Return the shift that moves a camera's masks into the hull of the others, frames; by how much the share outside
-    falls; and whether the shift is the same without any one of the frames (jackknife). 0, 0.0 if none does.
+    falls; and whether it is the same, to a frame, and not 0, without any one of the frames (jackknife). 0, 0.0 if none
+    does.
 
     Args:
         outside, area: (N, S) area outside the hull and whole area, of N frames and shifts from -S // 2 to S // 2.
     """
     total = np.array([outside, area])
     result = _lowest(*total.sum(axis=1))
-    return *result, all(_lowest(*np.delete(total, k, axis=1).sum(axis=1))[0] == result[0] for k in range(len(area)))
+    others = [_lowest(*np.delete(total, k, axis=1).sum(axis=1))[0] for k in range(len(area))]
+    return *result, all((abs(shift - result[0]) <= 1 and shift * result[0] > 0) or shift == result[0] for shift in others)
 
 
 def _lowest(outside: NDArray[np.float64], area: NDArray[np.float64]) -> tuple[int, float]:

@@ -256,6 +256,13 @@ class MaskAgreement:
             f"along their line of sight is unknown by more than 5 cm: use a camera from another side, at 30 to 150°"
         )
 
+    def mean_outside(self, frames: Sequence[Masks], cameras: Sequence[int]) -> float:
+        """Return the mean share of the masks (C, H, W) of these cameras outside the hulls of the others of them; NaN if
+        there is no hull."""
+        hulls = self.hulls([self.possible(masks) for masks in frames])
+        views = [(self.small(masks), hull) for masks, hull in zip(frames, hulls, strict=True) if hull is not None]
+        return self._mean_outside(views, cameras)
+
     def hulls(self, seen: Sequence[Bool]) -> list[Hull | None]:
         """Return each frame's hulls from its small masks (C, h, w); None if no two cameras see the same voxel."""
         grid = VoxelGrid.cover(self.volume, _COARSE)
