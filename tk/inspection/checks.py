@@ -337,8 +337,8 @@ def best_shift(outside: NDArray[np.float64], area: NDArray[np.float64]) -> tuple
     """
     total = np.array([outside, area])
     result = _lowest(*total.sum(axis=1))
-    others = [_lowest(*np.delete(total, k, axis=1).sum(axis=1))[0] for k in range(len(area))]
-    return *result, all((abs(shift - result[0]) <= 1 and shift * result[0] > 0) or shift == result[0] for shift in others)
+    rest = [_lowest(*np.delete(total, k, axis=1).sum(axis=1))[0] for k in range(len(area))]
+    return *result, all(abs(shift - result[0]) <= 1 and np.sign(shift) == np.sign(result[0]) for shift in rest)
 
 
 def _lowest(outside: NDArray[np.float64], area: NDArray[np.float64]) -> tuple[int, float]:
