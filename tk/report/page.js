@@ -29,7 +29,8 @@
 
   // --- header
   get("title").textContent = data.capture;
-  for (const [name, colors] of Object.entries(data.colors.sides)) {
+  const others = data.people.slice(1).map((person, k) => [`Person ${person.number}`, [data.colors.people[k + 1]]]);
+  for (const [name, colors] of [...Object.entries(data.colors.sides), ...others]) {
     const entry = document.createElement("span");
     for (const color of colors) entry.append(document.createElement("i"));
     entry.querySelectorAll("i").forEach((square, k) => { square.style.background = colors[k]; });
