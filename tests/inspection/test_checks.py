@@ -55,6 +55,7 @@ def test_turned_camera_is_named(tk: Tk, copy: Path) -> None:
     assert [bool(c["verdict"]) for c in found["cameras"]] == [False, True, False, False]
     assert found["findings"][0].startswith("camera cam2 is inconsistent with the others: off by ")
     assert found["cameras"][1]["shift_px"] > 5 and found["cameras"][1]["outside"] > 0.1
+    assert np.argmax([c["pairs_px"] for c in found["cameras"]]) == 1
 
 
 def test_inspect_and_track_refuse_the_cameras_of_another_recording(tk: Tk, copy: Path, tmp_path: Path) -> None:

@@ -69,6 +69,8 @@ class CameraReport:
         empty, cut: shares of the frames without a person, and with a person at the edge of the image.
         outside: share of its masks outside the hull of the other cameras.
         shift_px: smallest shift that moves its masks into that hull, pixels; NaN if none does.
+        pairs_px: error of its outlines in pairs with the others that are not wrong, median, pixels; NaN if no pair can
+            be tested.
         late_frames: frames by which its video starts late: its frame k shows what frame k + late of the others shows.
         bad_images: number of frames whose image is blank, frozen or moved.
         verdict: what is wrong, in words; empty if nothing is.
@@ -82,6 +84,7 @@ class CameraReport:
     cut: float
     outside: float
     shift_px: float
+    pairs_px: float
     late_frames: int
     bad_images: int
     verdict: str
@@ -128,14 +131,14 @@ class Inspection:
             f"{self.with_hull:.0%} of them have a visual hull; length of the person {self.extent_m:.2f} m",
             "",
             f"{'camera':12} {'mask':>6} {'specks':>7} {'holes':>6} {'empty':>6} {'cut':>5} {'outside':>8} "
-            f"{'shift':>9} {'late':>5}",
+            f"{'shift':>7} {'pairs':>7} {'late':>5}",
         ]
         for c in self.cameras:
-            shift = f"{c.shift_px:.0f} px" if np.isfinite(c.shift_px) else "?"
+            shift, pairs = (f"{px:.0f} px" if np.isfinite(px) else "?" for px in (c.shift_px, c.pairs_px))
             outside = f"{c.outside:.1%}" if np.isfinite(c.outside) else "-"
             lines.append(
                 f"{c.name:12} {c.area:6.1%} {c.specks:7.1%} {c.holes:6.1%} {c.empty:6.0%} {c.cut:5.0%} {outside:>8} "
-                f"{shift:>9} {c.late_frames:5d}"
+                f"{shift:>7} {pairs:>7} {c.late_frames:5d}"
             )
         lines += [
             "",
@@ -304,7 +307,7 @@ def _delays(
     compare: MaskAgreement, masks: dict[int, Masks], centers: Sequence[int], agreement: Agreement
 ) -> tuple[NDArray[np.int64], bool]:
     """Return the delay of each camera (C,) frames, the shift with which its masks lie in the hull of the others; and
-    whether it is certain: the same without any one of the frames (jackknife)."""
+    whether it is certain, see :func:`best_shift`."""
     C = len(compare.rig)
     small = {index: compare.small(m) for index, m in masks.items()}
     hulls = compare.hulls([compare.possible(masks[i]) for i in centers])
@@ -314,22 +317,34 @@ def _delays(
         best_shift(*_areas_by_shift(small, centers, hulls, [k for k in agreement.right if k != c], c, shifts))
         for c in range(C)
     ]
-    # a delayed camera also spoils the hulls for the others; the delayed one gains most from a shift
-    c = int(np.argmax([gain for _, gain, _ in found]))
+    # a delayed camera also spoils the hulls for the others, which then gain from a shift, too; only the shift of the
+    # delayed one makes all cameras agree
+    candidates = [c for c, (shift, *_) in enumerate(found) if shift]
+    if not candidates:
+        return late, True
+
+    def outside(c: int) -> float:
+        pairs = [(masks[i], masks[i + found[c][0]]) for i in centers if i + found[c][0] in masks]
+        this = np.arange(C)[:, None, None] == c
+        return compare.mean_outside([np.where(this, shifted, now) for now, shifted in pairs], agreement.right)
+
+    c = min(candidates, key=outside)
     late[c] = -found[c][0]
     return late, found[c][2]
 
 
 def best_shift(outside: NDArray[np.float64], area: NDArray[np.float64]) -> tuple[int, float, bool]:
     """Return the shift that moves a camera's masks into the hull of the others, frames; by how much the share outside
-    falls; and whether the shift is the same without any one of the frames (jackknife). 0, 0.0 if none does.
+    falls; and whether it is the same, to a frame, and not 0, without any one of the frames (jackknife). 0, 0.0 if none
+    does.
 
     Args:
         outside, area: (N, S) area outside the hull and whole area, of N frames and shifts from -S // 2 to S // 2.
     """
     total = np.array([outside, area])
     result = _lowest(*total.sum(axis=1))
-    return *result, all(_lowest(*np.delete(total, k, axis=1).sum(axis=1))[0] == result[0] for k in range(len(area)))
+    rest = [_lowest(*np.delete(total, k, axis=1).sum(axis=1))[0] for k in range(len(area))]
+    return *result, all(abs(shift - result[0]) <= 1 and np.sign(shift) == np.sign(result[0]) for shift in rest)
 
 
 def _lowest(outside: NDArray[np.float64], area: NDArray[np.float64]) -> tuple[int, float]:
@@ -406,6 +421,7 @@ def _camera(
         cut=cut / len(own),
         outside=float(agreement.outside[c]),
         shift_px=float(np.hypot(*agreement.shift_px[c])),
+        pairs_px=float(agreement.pairs_px[c]),
         late_frames=late,
         bad_images=len(bad_images),
         verdict=verdict,
