@@ -91,5 +91,10 @@ if ! "$venv/bin/python" -m pip --version >/dev/null 2>&1 || ! suitable "$venv/bi
   say "making $venv with $("$python" --version)"
   "$python" -m venv --clear "$venv"
 fi
-say "installing tk and its dependencies into $venv"
-"$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable '.[dev]' </dev/null
+say "installing tk and what it and its tests need into $venv, 1.7 GB; this takes some minutes"
+# pip's own list is long: name the files of 10 MB and more, and the end of the downloads
+PYTHONUNBUFFERED=1 "$venv/bin/python" -m pip install --disable-pip-version-check --progress-bar off --editable '.[dev]' \
+  </dev/null | awk '
+    /^ *(Downloading|Using cached) / && $NF == "MB)" && substr($(NF - 1), 2) + 0 >= 10 { sub(/.*\//, "", $(NF - 2)); print "setup: " tolower($1) " " $(NF - 2) " " $(NF - 1) " " $NF }
+    /^Installing collected packages/ { print "setup: unpacking " NF - 3 " packages" }
+    { fflush() }' >&2

@@ -101,7 +101,7 @@ def test_summary_lists_all_outcomes(tmp_path: Path) -> None:
         zip(
             [job.name for job in jobs],
             [
-                Outcome(DONE, 10, 6, 0, 10, 5.0, 2.345, 1.5, 0.031, 1.8, ("a note, with a comma",)),
+                Outcome(DONE, 10, 6, 1, 10, 5.0, 2.345, 1.5, 0.031, 1.8, ("a note, with a comma",)),
                 Outcome(FAILED, failure="x.mp4: is cut off"),
                 Outcome(),
             ],
@@ -113,6 +113,7 @@ def test_summary_lists_all_outcomes(tmp_path: Path) -> None:
         rows = list(csv.DictReader(file))
     assert [row["state"] for row in rows] == ["mostly lost", "failed", "waiting"]
     assert rows[0]["lost_percent"] == "60" and rows[0]["error_cm"] == "2.345" and rows[0]["frames_per_second"] == "2"
+    assert rows[0]["suspect"] == "1" and rows[0]["suspect_percent"] == "10"
     assert rows[0]["notes"] == "a note, with a comma" and rows[1]["notes"] == "x.mp4: is cut off"
     assert {rows[2][name] for name in ("frames", "error_cm", "seconds")} == {""}
     page = (tmp_path / "out" / "summary.html").read_text(encoding="utf-8")

@@ -53,6 +53,21 @@ def test_track_writes_a_complete_result(tk: Tk, quick: Path, tiny: Path, tmp_pat
     assert (config.voxels, config.seed) == (32, 5) and __version__ in found.software
 
 
+def test_track_without_output_takes_the_name_of_the_folder(
+    tk: Tk, quick: Path, copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The folder that `.` or a link stands for; the first line has the path."""
+    command = ["track", ".", "--config", quick, "--frames", ":1", "--causal"]
+    link = copy.parent / "link"
+    link.symlink_to(copy)
+    monkeypatch.chdir(copy)
+    ran = tk(*command)
+    expected = copy / f"{copy.name}.h5"
+    assert ran.code == 0 and ran.err.splitlines()[0] == f"note: the result is {expected}" and expected.is_file()
+    ran = tk("track", link, *command[2:])
+    ran.complaint(expected.name, "exists", "--force")
+
+
 def test_track_finds_the_person(tk: Tk, tracked: Path, tiny: Path) -> None:
     """With voxels of 7 cm and images of 160×120: a test of the whole chain, not of its accuracy."""
     ran = tk("evaluate", tracked, tiny / "truth.h5", "--json")
@@ -115,7 +130,7 @@ def test_demo_tracks_and_prints_the_accuracy(
     ("arguments", "parts"),
     [
         (["track"], ["CAPTURE", "tk track --help"]),
-        (["track", "x"], ["--output", "tk track --help"]),
+        (["batch", "x"], ["--output", "tk batch --help"]),
         (["track", "x", "-o", "r.h5", "--voxels", "many"], ["--voxels", "many"]),
         (["track", "x", "-o", "r.h5", "--frame", "3"], ["--frame"]),
         (["trak"], ["trak", "tk --help"]),

@@ -140,13 +140,12 @@ def test_named_settings_exist() -> None:
 
 
 def test_capture_examples_are_accepted(tmp_path: Path) -> None:
-    examples = [text for page in PAGES for text in blocks(page, "toml") if "[volume]" in text]
-    assert len(examples) == 2
+    examples = [text for name in ("capture", "tutorial") for text in blocks(ROOT / "docs" / f"{name}.md", "toml")]
+    examples = [text for text in examples if "[subject]" in text]
     for text, height in zip(examples, (1.78, 1.75), strict=True):
         (tmp_path / "capture.toml").write_text(text, encoding="utf-8")
         settings = read_settings(tmp_path / "capture.toml")
-        assert settings.unknown == () and settings.volume is not None
-        assert settings.subjects[0].height_m == height
+        assert settings.unknown == () and settings.subjects[0].height_m == height
     (tmp_path / "calibration.toml").write_text(toml_block("[metadata]"), encoding="utf-8")
     (camera,) = read_calibration(tmp_path / "calibration.toml").rig
     assert (camera.width, camera.height) == (640, 480)
@@ -168,11 +167,17 @@ def test_joint_names_are_all_listed() -> None:
 
 
 def test_every_page_is_in_the_index_and_in_the_readme() -> None:
-    pages = {page.stem for page in (ROOT / "docs").glob("*.md")} - {"index", "history"}
-    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8").splitlines()
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    pages = {page.stem for page in (ROOT / "docs").glob("*.md")} - {"README"}
+    index = (ROOT / "docs" / "index.rst").read_text(encoding="utf-8").split()
     assert pages <= set(index)
-    assert all(f"(docs/{page}.md)" in readme for page in pages)
+    for readme, folder in ((ROOT / "README.md", "docs/"), (ROOT / "docs" / "README.md", "")):
+        text = readme.read_text(encoding="utf-8")
+        assert all(f"({folder}{page}.md" in text for page in pages), readme
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_pages_have_no_directives_that_github_shows_as_text(page: Path) -> None:
+    assert not re.findall(r"^[`:]{3,}\{.*|\{[\w:]+\}`", page.read_text(encoding="utf-8"), re.M)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

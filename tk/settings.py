@@ -120,7 +120,7 @@ class Settings:
 
     Attributes:
         voxels: voxels along the working volume's longest side (the paper: 64 and 128).
-        seed: seed of the one random generator.
+        seed: seed of the random numbers: candidate poses of the limb search, and the volumetric tracker's samples.
         segmentation: "collinearity" (the paper's) or "mog2".
         ahead: frames that a separate process decodes and segments ahead of the tracker; 0: no such process, each frame
             is prepared when the tracker asks for it. The result is the same.

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import struct
-import sys
+from dataclasses import replace
 from pathlib import Path
 
 import ezc3d
 import numpy as np
 import pytest
 
-from tests.conftest import Tk
 from tests.export.conftest import FPS, FRAMES, LOST, Write
-from tk.errors import ExportError, ResultError
 from tk.export import export, read_motion
 from tk.export.c3d import write_c3d
 from tk.model.body.skeleton import JOINTS, SEGMENTS
@@ -48,18 +46,19 @@ def test_full_disk_is_reported(write: Write) -> None:
         write_c3d(motion, Path("/dev/full"))
 
 
-def test_missing_points_have_residual_minus_one(write: Write) -> None:
-    """The words of a point, read without ezc3d: x, y, z and residual with cameras, as 32-bit floats."""
-    path = write()
-    data = export(path, ["c3d"]).files[0].read_bytes()
+def words_of(path: Path) -> np.ndarray:
+    """(F, P, 4) x, y, z and residual with cameras, read without ezc3d."""
+    data = path.read_bytes()
     count, (first, last) = struct.unpack_from("<H", data, 2)[0], struct.unpack_from("<HH", data, 6)
     scale, block = struct.unpack_from("<fH", data, 12)
     assert scale < 0, "floats"
     frames = last - first + 1
-    words = np.frombuffer(data, "<f4", frames * count * 4, 512 * (block - 1)).reshape(frames, count, 4)
-    assert 512 * (block - 1) + 16 * frames * count > len(data) - 512, (
-        "nothing after the points but the last block's rest"
-    )
+    assert 512 * (block - 1) + 16 * frames * count > len(data) - 512, "nothing after the points but their block's rest"
+    return np.frombuffer(data, "<f4", frames * count * 4, 512 * (block - 1)).reshape(frames, count, 4)
+
+
+def test_missing_points_have_residual_minus_one(write: Write) -> None:
+    words = words_of(export(write(), ["c3d"]).files[0])
     missing = np.isin(np.arange(FRAMES), LOST)
     assert (words[missing] == [0, 0, 0, -1]).all()
     assert (words[~missing, :, 3] >= 0).all() and (words[~missing, :, :3] != 0).any(axis=2).all()
@@ -73,15 +72,33 @@ def test_residual_is_the_standard_deviation(write: Write) -> None:
     residuals = file["data"]["meta_points"]["residuals"][0]
     assert residuals[0, 0] == 12 and residuals[3, 0] == 0 and residuals[0, LOST[0]] == -1
     assert residuals[4, 0] == 127, "as much as the format holds, and not what is left over from 256"
+    words = words_of(path.with_suffix(".c3d"))
+    assert [int(word) & 0xFF for word in words[0, 3:5, 3]] == [0, 127] and (words[list(LOST), :, 3] == -1).all()
 
 
-def test_missing_package_stops_its_format_only(tk: Tk, write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write()
-    monkeypatch.setitem(sys.modules, "ezc3d", None)
-    with pytest.raises(ExportError, match=r"c3d: needs the package ezc3d: pip install 'tk-mocap\[export\]'"):
-        export(path, ["c3d"])
-    assert not list(path.parent.glob("*c3d*"))
-    assert not issubclass(ExportError, ResultError)
-    ran = tk("export", path, "--to", "c3d,trc,bvh")
-    assert ran.code == 1 and ran.err.splitlines()[-1].startswith("tk: not written: c3d: needs the package ezc3d")
-    assert path.with_suffix(".trc").exists() and path.with_suffix(".bvh").exists()
+@pytest.mark.parametrize(("count", "first"), [(FRAMES, 30), (65535, 30), (65536, 30), (FRAMES, 70000)])
+def test_frames_have_their_numbers_in_the_recording(write: Write, tmp_path: Path, count: int, first: int) -> None:
+    """The numbers of 32 bits and, where they fit, of 16 bits; every frame is read back. One point and segment: fast."""
+    motion, _ = read_motion(write())
+    rows = np.arange(count) % FRAMES
+    motion = replace(
+        motion,
+        result=replace(motion.result.at_rows(rows), frames=first + np.arange(count)),
+        point_names=("pelvis",),
+        points=motion.points[rows][:, [motion.point_names.index("pelvis")]],
+        sigma=np.zeros((count, 1)),
+        segments=("pelvis",),
+        rotations=motion.rotations[rows][:, [motion.segments.index("pelvis")]],
+        known=motion.known[rows],
+    )
+    note = write_c3d(motion, tmp_path / "long.c3d")
+    assert (note is None) == (count <= 65535), "only a long file lacks the segments"
+    file = ezc3d.c3d(str(tmp_path / "long.c3d"))
+    assert file["data"]["points"].shape == (4, 1, count)
+    np.testing.assert_allclose(file["data"]["points"][:3, :, -1].T / 1000, motion.points[-1], atol=1e-6)
+    assert file["data"]["rotations"].shape[3] == (count if note is None else 0)
+    start, end = (file["parameters"]["TRIAL"][f"ACTUAL_{name}_FIELD"]["value"] for name in ("START", "END"))
+    assert [int(low) % 65536 + 65536 * int(high) for low, high in (start, end)] == [first + 1, first + count]
+    header = file["header"]["points"]
+    assert header["last_frame"] - header["first_frame"] + 1 == count
+    assert header["first_frame"] == (first if first < 65535 else 0)

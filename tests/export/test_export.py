@@ -49,9 +49,12 @@ def test_csv_of_points(write: Write) -> None:
 
 
 def test_csv_of_angles(write: Write) -> None:
-    _, angles = export(write(), ["csv"]).files
+    written = export(write(), ["csv"])
+    angles = written.files[1]
+    assert written.notes[-1] == f"{angles}: blank: neck rotation: the body has no degree of freedom for it"
     assert angles.name == "walk_angles.csv"
     rows = rows_of(angles)
+    assert {row["degrees"] for row in rows if (row["joint"], row["angle"]) == ("neck", "rotation")} == {""}
     knee = [row for row in rows if row["joint"] == "knee_l"]
     assert len(knee) == FRAMES and knee[LOST[0]]["degrees"] == ""
     expected = np.degrees(poses()[3, SKELETON.index("knee_l_flexion")])
@@ -102,7 +105,8 @@ def test_smoothed_here_where_the_result_has_no_copy(write: Write) -> None:
     path = write()
     written = export(path, ["csv", "bvh"], smoothed=True)
     assert written.files[0].name == "walk_smoothed.csv"
-    assert "smoothed for this export" in written.notes[0] and len(written.notes) == 1  # nothing is held
+    assert "smoothed for this export" in written.notes[0]
+    assert not any("held" in note for note in written.notes)
     motion, _ = read_motion(path, smoothed=True)
     assert motion.known.all() and motion.bridged.sum() == len(LOST)
     true = np.array([SKELETON.joints(pose) for pose in poses()])

@@ -9,7 +9,7 @@ import pygltflib
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from tests.export.conftest import FPS, FRAMES, LOST, Write
+from tests.export.conftest import FIRST, FPS, FRAMES, LOST, Write
 from tests.model.figures import surface_points
 from tk.export import export, read_motion
 from tk.io.results.reader import read_result
@@ -94,7 +94,8 @@ def test_lost_frames_are_held_and_listed(write: Write) -> None:
     for name, T in frame_transforms(file, LOST[1]).items():
         np.testing.assert_array_equal(T, before[name])
     frames = read_motion(path)[0].result.frames
-    assert file.asset.extras["lost_frames"] == [int(frames[f]) for f in LOST]
+    first = {"first_frame": FIRST, "first_time": FIRST / FPS}
+    assert file.asset.extras == {**first, "lost_frames": [int(frames[f]) for f in LOST]}
 
 
 def test_skinned_mesh_lies_on_the_body(write: Write) -> None:

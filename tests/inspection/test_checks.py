@@ -55,6 +55,7 @@ def test_turned_camera_is_named(tk: Tk, copy: Path) -> None:
     assert [bool(c["verdict"]) for c in found["cameras"]] == [False, True, False, False]
     assert found["findings"][0].startswith("camera cam2 is inconsistent with the others: off by ")
     assert found["cameras"][1]["shift_px"] > 5 and found["cameras"][1]["outside"] > 0.1
+    assert np.argmax([c["pairs_px"] for c in found["cameras"]]) == 1
 
 
 def test_inspect_and_track_refuse_the_cameras_of_another_recording(tk: Tk, copy: Path, tmp_path: Path) -> None:
@@ -156,6 +157,23 @@ def test_time_offset_is_a_note_and_no_problem(tk: Tk, copy: Path) -> None:
     assert "note: time offsets: " in ran.out
     shown = ran.out.split("note: ")[0].rstrip().splitlines()[-1]
     assert shown == "No problems found." or shown.startswith("camera cam2 is inconsistent")
+
+
+def test_a_video_that_begins_late_is_compared_where_all_cameras_have_images(tk: Tk, copy: Path) -> None:
+    late, path = 6, copy / "calibration.toml"
+    capture = open_capture(copy)
+    with capture.frames() as frames:
+        images = [frame.images[1].copy() for frame in frames]
+    capture.clips[1].path.unlink()
+    write_video(copy / "videos" / "cam2.avi", images[late:], capture.fps)
+    masks = sorted((copy / "masks" / "cam2").iterdir())
+    for k, mask in enumerate(masks):
+        mask.replace(masks[k - late]) if k >= late else mask.unlink()
+    path.write_text(path.read_text().replace("[cam2]\n", f"[cam2]\ntime_offset = {late / capture.fps}\n", 1))
+    found = json.loads(tk("inspect", copy, "--json").out)
+    assert found["frames"][0] == late and found["people"][0]["frames"][0] >= late
+    assert [c["verdict"] for c in found["cameras"]] == ["", "", "", ""]
+    assert not any("cam2" in line for line in found["findings"])
 
 
 def test_empty_masks_are_reported(tk: Tk, copy: Path) -> None:

@@ -118,7 +118,7 @@ def test_people_are_numbered_in_the_order_in_which_they_enter_the_volume(
     first, second, third, never = 0.1, 0.5, 1.1, 2.5
     looks = iter([[never, 1.5, first], [never, 1.4, first, second]] + 20 * [[never, third, first, second]])
     monkeypatch.setattr(PeopleFinder, "find", lambda *_: tuple(map(person, next(looks))))
-    watch = PeopleWatch(open_capture(crossing), FRAMES)
+    watch = PeopleWatch(open_capture(crossing), range(FRAMES))
     for index in filter(watch.wants, range(FRAMES)):
         watch.look(index, np.zeros((4, 120, 160), np.uint8), None)
     assert [(p.number, p.path[-1][0]) for p in watch.people()] == list(enumerate([first, second, third, never]))
@@ -132,7 +132,7 @@ def test_numbers_of_the_first_frame_stay_when_a_ghost_is_left_out(
 
     looks = iter([(person(0.1), person(0.3), person(1.0))] + 20 * [(person(0.1), person(1.0))])
     monkeypatch.setattr(PeopleFinder, "find", lambda *_: next(looks))
-    watch = PeopleWatch(open_capture(crossing), FRAMES)
+    watch = PeopleWatch(open_capture(crossing), range(FRAMES))
     for index in filter(watch.wants, range(FRAMES)):
         watch.look(index, np.zeros((4, 120, 160), np.uint8), None)
     assert [(p.number, p.path[0][0]) for p in watch.people()] == [(0, 0.1), (2, 1.0)]

@@ -95,6 +95,21 @@ def test_a_killed_process_does_not_switch_the_cache_off_for_good(tmp_path, age_s
     assert lock.exists() == stays
 
 
+@pytest.mark.parametrize("is_compiled", [False, True])
+def test_compiling_is_announced_only_if_nothing_is_compiled_yet(tmp_path, is_compiled):
+    if is_compiled:
+        (tmp_path / "T1.tic").touch()
+    code = """
+        import logging, sys
+        from tk.kernels.runtime import ensure_runtime
+        logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(message)s")
+        ensure_runtime()
+    """
+    words = run(code, TI_OFFLINE_CACHE_FILE_PATH=str(tmp_path))
+    assert words[:3] == ["starting", "the", "kernels" if is_compiled else "kernels;"]
+    assert ("compiling" in words) != is_compiled
+
+
 @pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="needs a list of the process's threads")
 def test_the_threads_end_before_the_interpreter_does():
     """A runtime that is taken apart with the interpreter has crashed one in some thousand processes at its end."""

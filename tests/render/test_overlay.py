@@ -28,8 +28,10 @@ from tk.model.body.skeleton import JOINTS, build_skeleton
 from tk.model.cameras.camera import Camera, Rig
 from tk.render.canvas import View, dots, draw_body, draw_joints
 from tk.render.figure import Figure, Seen, solids_of
+from tk.render.legend import LEGEND_HEIGHT, Legend
 from tk.render.overlay import Grid, Overlay, write_sheets
 from tk.render.palette import BONE, LOST, LOST_BODY, SEGMENT_COLORS, person_color, sigma_colors
+from tk.render.people import People
 from tk.trackers.bodies import body_and_poses
 
 DEMO = Path(__file__).resolve().parents[2] / "tk" / "data" / "demo"
@@ -219,6 +221,53 @@ def test_second_person_is_drawn_in_one_colour(result: Path) -> None:
         ((frame, images),) = overlay.pictures([0])
         colored.append(np.count_nonzero((overlay.mosaic(frame, images) == person_color(1)).all(axis=2)))
     assert colored[1] > colored[0] + 100
+
+
+def shows(picture: np.ndarray, color: tuple[int, int, int]) -> bool:
+    """Return whether a square of a colour is in a legend."""
+    return np.count_nonzero((picture == color).all(axis=2)) >= 50
+
+
+def test_legend_names_the_colours_that_are_seen(result: Path) -> None:
+    one = read_result(result)
+    two = replace(one, others=(replace(one, person=1),))
+    with_sigma = replace(one, sigma=np.full((3, len(JOINTS)), 0.01))
+    strips = []
+    for shown in (one, two, replace(one, model={}), with_sigma):
+        strips.append(np.zeros((LEGEND_HEIGHT, 960, 3), np.uint8))
+        Legend(People(shown.aligned()), 960).draw(strips[-1], 0)
+    limbs = [SEGMENT_COLORS[name] for name in ("upper_arm_l", "thigh_l", "upper_arm_r", "thigh_r", "torso")]
+    assert [[shows(strip, color) for color in limbs] for strip in strips] == [[True] * 5] * 2 + [[False] * 5] + [
+        [True] * 5
+    ]
+    assert [shows(strip, person_color(1)) for strip in strips] == [False, True, False, False]
+    ramp = sigma_colors([0.0])[0]
+    assert [bool((strip == ramp).all(axis=2).any()) for strip in strips] == [False] * 3 + [True]
+    narrow = np.zeros((LEGEND_HEIGHT, 320, 3), np.uint8)
+    Legend(People(two.aligned()), 320).draw(narrow, 0)
+    assert not shows(narrow, limbs[0]), "no room"
+
+
+def test_camera_that_was_left_out_is_dark_and_named(result: Path) -> None:
+    capture, one = open_capture(DEMO, masks="none"), read_result(result)
+    residual = np.full((3, 5, 2), 0.05)
+    residual[0, 1] = np.nan
+    meta = replace(one.meta, residual_cameras=capture.rig.names)
+    overlay, plain = (
+        Overlay(capture, replace(one, meta=meta, residual=values)) for values in (residual, np.full((3, 5, 2), 0.05))
+    )
+    for frame, images in overlay.pictures([0, 1]):
+        height, width = overlay.grid.cell
+        tiles = [o.mosaic(frame, images)[:height, width : 2 * width].copy() for o in (overlay, plain)]
+        sheets = [o.sheet_row(frame, images)[:, 276:546] for o in (overlay, plain)]
+        for marked, usual in (tiles, sheets):
+            if frame == 1:
+                np.testing.assert_array_equal(marked, usual)
+                continue
+            assert np.median(marked[20:]) < 0.5 * np.median(usual[20:])
+            name = marked[:20].astype(int)
+            assert (name[..., 2] - name[..., 0] > 60).any(), "its name is red"
+    assert People(replace(one, meta=meta, residual=residual).aligned()).left_out.sum() == 1
 
 
 def test_videos_show_where_the_person_moves(result: Path) -> None:

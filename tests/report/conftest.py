@@ -17,7 +17,6 @@ from tk.io.results.data import JointAngles, Result
 from tk.io.results.reader import read_joints
 from tk.io.results.revision import revise_result
 from tk.io.results.status import Status
-from tk.model.body.angles import ANGLES
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.model.body.skeleton import SEGMENTS
@@ -60,7 +59,7 @@ def complete_result(path: Path, capture_path: Path, count: int = FRAMES) -> Path
         fps=capture.fps, up=capture.up, capture="made <up>", method="region",
         config_toml=settings_file.to_toml(Settings()), timing_stages=("decode", "optimise", "total"), sigma=True,
         residual_cameras=capture.rig.names, segment_names=SEGMENTS, feet=True,
-        angles=tuple(JointAngles(a.joint, a.names, a.convention) for a in ANGLES), objective_kind="E_S",
+        angles=JointAngles.of_body(skeleton.names), objective_kind="E_S",
     )  # fmt: skip
     revise_result(path, notes=["first", NOTE])
     return path

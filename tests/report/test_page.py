@@ -21,7 +21,8 @@ from tk.evaluation.joints import evaluate_files
 from tk.io.results.data import Result
 from tk.io.results.reader import read_result
 from tk.io.results.status import Status
-from tk.model.body.joints import JOINTS, ROWS
+from tk.model.body.expected_error import in_cm
+from tk.model.body.joints import JOINTS
 from tk.render.figure import figure_of
 from tk.report.data import hinge_sigma_deg
 from tk.report.page import build_page, made_here
@@ -83,17 +84,39 @@ def test_body_points_match_the_overlay(complete: Path) -> None:
         )
 
 
-def test_expected_error_adds_the_offset_of_a_joint_to_sigma(complete: Path) -> None:
+def test_expected_error_is_a_range_for_all_joints_and_for_each(complete: Path) -> None:
     result = read_result(complete)
-    assert result.sigma is not None and result.expected_error is not None
-    expected = unpacked(data_of(build_page(result, []))["people"][0]["expected"])
-    knee, hip = JOINTS.index("knee_l"), JOINTS.index("hip_r")
-    for joint, offset in ((knee, ROWS["knee_l"].offset_m), (hip, ROWS["hip_l"].offset_m)):
-        assert offset > 0
-        np.testing.assert_allclose(expected[:, joint] ** 2, 3 * result.sigma[:, joint] ** 2 + offset**2, rtol=1e-5)
-    assert np.isnan(expected[3, 8]), "unknown where sigma is unknown"
+    assert result.expected_error is not None and result.mean_error_range is not None
+    (person,) = data_of(build_page(result, []))["people"]
+    assert person["expectedMean"] == in_cm(result.mean_error_range)
+    low, high = 100 * result.mean_error_range
+    assert low < 100 * np.nanmean(result.expected_error[result.has_pose]) < high
+    assert len(person["expected"]) == len(JOINTS) and all(" to " in text for text in person["expected"])
+    assert np.isnan(result.expected_error[3, 8]), "unknown where sigma is unknown"
     without = replace(result, sigma=None)
-    assert without.expected_error is None
+    assert without.expected_error is without.mean_error_range is None
+    (person,) = data_of(build_page(without, []))["people"]
+    assert (person["expectedMean"], person["expected"]) == ("", None)
+
+
+def left_out(result: Result, camera: int, rows: slice) -> Result:
+    """Return a result without a camera in some frames."""
+    assert result.residual is not None
+    residual = result.residual.copy()
+    residual[rows, camera] = np.nan
+    return replace(result, residual=residual)
+
+
+def test_cameras_that_were_left_out_are_counted(complete: Path) -> None:
+    result = read_result(complete)
+    assert data_of(build_page(result, []))["leftOut"] == [0, 0, 0, 0]
+    one = left_out(result, 2, slice(None))
+    assert data_of(build_page(one, []))["leftOut"] == [0, 0, FRAMES - len(LOST), 0], "not in lost frames"
+    two = left_out(with_partner(result), 2, slice(None))
+    assert data_of(build_page(two, []))["leftOut"] == [0, 0, 5, 0], (
+        "where the second person has a pose, too, it was used"
+    )
+    assert data_of(build_page(replace(result, residual=None), []))["leftOut"] == []
 
 
 def test_page_has_errors_only_with_a_truth(complete: Path, tiny: Path, tmp_path: Path) -> None:
@@ -289,6 +312,8 @@ def test_page_has_a_block_for_each_person(complete: Path, page: Page, tmp_path: 
     page.said.clear()
     page.open(target)
     rows = page.run("[...document.querySelectorAll('#people tr')].map((row) => row.textContent)")
+    key = page.run("document.getElementById('key').textContent")
+    assert " ".join(key.split()) == "left right trunk, head Person 1"
     assert len(rows) == 3 and "Person 1" in rows[2] and f"1 of {FRAMES - 4}" in rows[2]
     assert page.run("document.querySelector(document.querySelectorAll('#people a')[1].hash).id") == "person-1"
     assert page.run("document.querySelectorAll('#angle-charts-1 .chart').length") > 15
@@ -298,6 +323,28 @@ def test_page_has_a_block_for_each_person(complete: Path, page: Page, tmp_path: 
         assert page.run("document.getElementById('badge').hidden") is alone
     assert page.run("document.documentElement.scrollWidth <= window.innerWidth") is True, "nothing sticks out"
     assert page.said == []
+
+
+@chromium
+@pytest.mark.parametrize(
+    "rows, title, text",
+    [
+        (slice(None), "made <up>: 3 of 4 cameras used", "Left out: cam3 (all frames)."),
+        (slice(0, 3), "made <up>", f"Left out: cam3 (3 of {FRAMES - len(LOST)} frames)."),
+    ],
+)
+def test_headline_counts_the_cameras_used(
+    complete: Path, page: Page, tmp_path: Path, rows: slice, title: str, text: str
+) -> None:
+    target = tmp_path / "page.html"
+    target.write_text(build_page(left_out(read_result(complete), 2, rows), []), encoding="utf-8")
+    page.said.clear()
+    page.open(target)
+    assert page.run("document.getElementById('title').textContent") == title
+    assert page.run("document.getElementById('left-out').textContent").startswith(text)
+    assert page.run("document.getElementById('left-out').hidden") is False
+    numbers = page.run("[...document.querySelectorAll('#now-cameras .number')].map((box) => box.textContent)")
+    assert numbers[2] == "left out" and numbers[1].endswith("%") and page.said == []
 
 
 def test_people_with_different_frames_are_aligned(complete: Path) -> None:

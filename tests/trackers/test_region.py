@@ -18,13 +18,16 @@ from tk.model.body.gait_poses import standing_pose, walking_pose
 from tk.model.body.limb_candidates import exchanged, pairs, turned
 from tk.model.body.skeleton import JOINTS, shoulder_angles
 from tk.model.cameras.camera import Rig
+from tk.model.cameras.volume import Volume
 from tk.model.cues.landmarks import ROWS
 from tk.model.cues.ray_costs import Evidence, RayGrid
-from tk.model.setup import InitPose, Subject
-from tk.settings import RegionSettings, SilhouetteSettings
+from tk.model.setup import InitPose, Setup, Subject
+from tk.settings import RegionSettings, Settings, SilhouetteSettings
+from tk.trackers.limb_search import LimbSearch
 from tk.trackers.region import UNKNOWN_AFTER, RegionTracker
 from tk.trackers.residual import LEAST_SPREAD
 from tk.trackers.second_pass import second_of_two
+from tk.trackers.silhouette import SilhouetteTracker
 
 RIG = ring_of_cameras(3, width=160, height=200)
 SKELETON = BODY.skeleton
@@ -127,6 +130,26 @@ def test_limb_search_finds_an_arm_that_has_jumped() -> None:
     assert errors(found[0], raised[3])[wrist] > 0.25
     assert errors(found[1], raised[3])[wrist] < 0.06
     assert errors(found[1], raised[3]).mean() < 1.5 * CLOSE_M
+
+
+def test_seed_draws_the_candidates_of_the_limb_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[float] = []
+
+    def better(search: LimbSearch, level: int, misplaced: object, rng: np.random.Generator) -> np.ndarray:
+        drawn.append(rng.random())
+        return np.empty((0, len(POSES[0])))
+
+    monkeypatch.setattr(LimbSearch, "better", better)
+    for seed in (0, 0, 1):
+        tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=1 / 15))
+        tracker.seed = seed
+        for i in range(2):
+            tracker.step(observe(MASKS[0], i))
+    same, again, other = np.array(drawn).reshape(3, -1)[:, 1:]  # `tracker_at` searches with the default
+    assert (same == again).all() and (same != other).all()
+    setup = Setup(RIG, Volume((0.0, 0.0, 1.0), (2.0, 2.0, 2.0)), "z", 15.0, (Subject(STATURE),))
+    for kind in (RegionTracker, SilhouetteTracker):
+        assert kind.of(setup, Settings(seed=5)).seed == 5
 
 
 def test_high_residual_triggers_a_limb_search() -> None:

@@ -311,7 +311,7 @@ def test_frames_without_known_joints_are_reported(
     (line,) = (note for note in result.notes if "σ is unknown" in note)
     assert line.endswith(f"σ is unknown, frames {first} to 3") and line in reporter.notes
     (text,) = _expected_error(tmp_path / "r.h5")
-    assert text.endswith(f" cm, unknown in {4 - first} frames")
+    assert text.endswith(f" cm (constant offsets included), unknown in {4 - first} frames")
     if causal:  # returned estimates are those of the first pass
         notes: list[str] = []
         assert len(list(estimates(task(tiny, (0, 10)), notes.append))) == 10

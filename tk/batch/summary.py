@@ -31,7 +31,9 @@ class Column:
 NUMBERS = (
     Column("frames", lambda o: o.frames or None, "frames", "", ".0f"),
     Column("lost", lambda o: o.lost if o.frames else None),
+    Column("suspect", lambda o: o.suspect if o.frames else None),
     Column("lost_percent", lambda o: 100 * o.lost / o.frames if o.frames else None, "lost", "%", ".1f"),
+    Column("suspect_percent", lambda o: 100 * o.suspect / o.frames if o.frames else None, "suspect", "%", ".1f"),
     Column("error_cm", lambda o: o.error_cm, "error", "cm"),
     Column("limbs_cm", lambda o: o.limbs_cm, "limbs", "cm"),
     Column("silhouette_error", lambda o: o.silhouette_error, "E<sub>S</sub>", "%", ".2%"),
@@ -42,6 +44,9 @@ NUMBERS = (
 
 #: columns of captures with ground truth
 _WITH_TRUTH = ("error_cm", "limbs_cm")
+
+# columns whose numbers are marked unless they are 0
+_BAD = ("lost_percent", "suspect_percent")
 
 # seconds between two reloads of the page while the batch runs
 _REFRESH_S = 10
@@ -123,9 +128,12 @@ def _counts(states: Sequence[str], outcomes: Mapping[str, Outcome]) -> str:
     counts.append((len(states) - sum(count for count, _ in counts), "waiting"))
     frames = sum(outcome.frames for outcome in outcomes.values())
     lost = sum(outcome.lost for outcome in outcomes.values())
+    suspect = sum(outcome.suspect for outcome in outcomes.values())
     parts = [f"{count} {word}" for count, word in counts if count]
     when = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M")
-    return f"{len(states)} captures: {', '.join(parts)}. {frames} frames, {lost} of them lost. {when}"
+    return (
+        f"{len(states)} captures: {', '.join(parts)}. {frames} frames, {lost} of them lost, {suspect} suspect. {when}"
+    )
 
 
 def _line(job: Job, outcome: Outcome, columns: Sequence[Column]) -> str:
@@ -141,6 +149,6 @@ def _line(job: Job, outcome: Outcome, columns: Sequence[Column]) -> str:
     for column in columns:
         value = column.value(outcome)
         text = "" if value is None else format(value, column.pattern).removesuffix("%")
-        cells.append(f"<td{' class=bad' if column.name == 'lost_percent' and value else ''}>{text}</td>")
+        cells.append(f"<td{' class=bad' if column.name in _BAD and value else ''}>{text}</td>")
     cells.append(f'<td class="text notes">{html.escape(_notes(outcome))}</td>')
     return f"<tr>{''.join(cells)}</tr>"

@@ -190,7 +190,7 @@ _TRACKING_OPTIONS = (
     voxels_option,
     cameras_option,
     frames_option,
-    click.option("--seed", type=int, help="Seed of the random generator.  [default: 0]"),
+    click.option("--seed", type=int, help="Seed of the random candidate poses.  [default: 0]"),
     masks_option,
     click.option("--body", type=PATH, metavar="FILE", help="Use the body of a result (.h5) or of a TOML file."),
     click.option(

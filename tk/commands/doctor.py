@@ -128,13 +128,14 @@ def _encoder() -> str:
 
 
 def _cache() -> str:
-    code = "from tk.segmenters.weights import default_cache_dir as d\nimport tk.kernels.runtime\nprint(d())"
+    code = "from tk.segmenters.weights import default_cache_dir as d\nimport tk.kernels.runtime\nprint(d().parent)"
     folder = Path(_try(code))
     existing = next(path for path in (folder, *folder.parents) if path.exists())
-    size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) / 1e6
+    parts = ("taichi", "tk")  # the compiled kernels; the segmenter's weights
+    size = sum(file.stat().st_size for part in parts for file in (folder / part).rglob("*") if file.is_file()) / 1e6
     if not os.access(existing, os.W_OK):
         raise Missing(f"{existing} is not writable, so every start compiles the kernels again: chmod u+w it")
-    return f"{folder}, {size:.0f} MB, {shutil.disk_usage(existing).free / 1e9:.0f} GB free"
+    return f"{folder / parts[0]} and {parts[1]}, {size:.0f} MB, {shutil.disk_usage(existing).free / 1e9:.0f} GB free"
 
 
 def _cores() -> str:
@@ -182,7 +183,6 @@ CHECKS: dict[str, Callable[[], str]] = {
     "cores": _cores,
     "memory": _memory,
     "segmenter": _segmenter,
-    "ezc3d": _extra("ezc3d", "tk export --to c3d", "export"),
     "Dask": _extra("distributed", "tk batch", "cluster"),
     "pandas": _extra("pandas", "tables of a result", "tables"),
     "xarray": _extra("xarray", "tables of a result", "tables"),

@@ -27,12 +27,16 @@ WARN_SHARE = 0.2
 
 @click.command(
     epilog=base.example(
+        "tk track CAPTURE",
         "tk track CAPTURE -o result.h5",
         "tk track CAPTURE -o part.h5 --frames 0:100 --cameras cam1,cam2,cam4",
     )
 )
 @base.capture_argument
-@click.option("-o", "--output", required=True, type=base.PATH, metavar="RESULT.h5")
+@click.option(
+    "-o", "--output", type=base.PATH, metavar="RESULT.h5",
+    help="The result.  [default: the name of CAPTURE's folder, in the current folder]",
+)  # fmt: skip
 @base.tracking_options
 @click.option(
     "--init-pose", type=base.PATH, metavar="FILE",
@@ -45,7 +49,7 @@ WARN_SHARE = 0.2
 @base.json_option
 def track(
     capture: Path,
-    output: Path,
+    output: Path | None,
     resume: bool,
     force: bool,
     no_report: bool,
@@ -58,6 +62,9 @@ def track(
 
     An overlay video (RESULT.mp4) and a report (RESULT.html) are written next to it.
     """
+    if output is None:
+        output = Path(f"{capture.resolve().name}.h5")
+        base.print_lines("note: the result is ", [output.absolute()])
     reporter = ConsoleReporter(quiet, None, *later_stages(causal, no_report), "loading")
     with reporter, started_early():
         from tk.io.importers import open_recording
@@ -102,20 +109,21 @@ def draw_video_and_report(
 
 
 def _expected_error(path: Path) -> list[str]:
-    """Return a text with the expected error of a joint, median over joints and frames with a pose, and the number of
-    frames, beside the suspect ones, in which it is unknown; [] if it always is."""
+    """Return a text with the range of the expected mean error, and the number of frames, beside the suspect ones, in
+    which sigma is unknown; [] if it always is."""
     import numpy as np
 
     from tk.io.results.reader import read_result
     from tk.io.results.status import Status
+    from tk.model.body.expected_error import in_cm
 
     result = read_result(path)
-    expected = result.expected_error
-    if expected is None or not np.isfinite(expected[result.has_pose]).any():
+    expected = result.mean_error_range
+    if result.sigma is None or expected is None:
         return []
-    unknown = np.count_nonzero((result.status < Status.LOST) & np.isnan(expected).all(axis=1))
+    unknown = np.count_nonzero((result.status < Status.LOST) & np.isnan(result.sigma).all(axis=1))
     beside = f", unknown in {unknown} frames" if unknown else ""
-    return [f"expected error of a joint {100 * np.nanmedian(expected[result.has_pose]):.1f} cm{beside}"]
+    return [f"expected mean error of the joints {in_cm(expected)} (constant offsets included){beside}"]
 
 
 def end(output: Path, summary: Summary, quiet: bool, as_json: bool) -> None:

@@ -8,7 +8,6 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 
 from tk.errors import ExportError, ResultError, TkError
@@ -26,7 +25,8 @@ from tk.io.results.reader import read_result
 
 __all__ = ["FORMATS", "Exported", "Motion", "export", "read_motion"]
 
-Writer = Callable[[Motion, Path], None]
+# writes a file or a folder, and returns a note for the user if the format cannot hold all of the motion
+Writer = Callable[[Motion, Path], str | None]
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,12 @@ class Format:
     outputs: tuple[tuple[str, Writer], ...]
     begins: bytes | None = None  # regular expression for the begin of its files; None for a folder
     holds: bool = False  # True if it cannot mark a pose as unknown
-    package: str = ""  # a package that it needs beyond those of tk itself
 
 
 FORMATS = {
     "trc": Format(((".trc", write_trc),), rb"PathFileType\t"),
     "mot": Format(((".mot", write_mot),), rb"[^\n]*\nversion=1\n"),
-    "c3d": Format(((".c3d", write_c3d),), rb".P", package="ezc3d"),
+    "c3d": Format(((".c3d", write_c3d),), rb".P"),
     "bvh": Format(((".bvh", write_bvh),), rb"HIERARCHY", holds=True),
     "csv": Format(((".csv", write_points_csv), ("_angles.csv", write_angles_csv)), rb"frame,time,status,"),
     "gltf": Format(((".glb", write_glb),), rb"glTF", holds=True),
@@ -84,11 +83,6 @@ def export(
         ExportError: a format is unknown, a file exists, or none of the formats can be written.
     """
     chosen = _chosen(formats, bvh_units)
-    failed = {
-        name: f"needs the package {form.package}: pip install 'tk-mocap[export]'"
-        for name, form in chosen.items()
-        if form.package and find_spec(form.package) is None
-    }
     path = Path(result)
     folder = path.parent if folder is None else folder
     people = read_result(path).people
@@ -96,19 +90,19 @@ def export(
         (person, name, folder / f"{path.stem}{_number(person, people)}{smoothed * '_smoothed'}{ending}", write)
         for person in people
         for name, form in chosen.items()
-        if name not in failed
         for ending, write in form.outputs
     ]
     capture = next((each for each in resolved(folder).parents if (each / "calibration.toml").is_file()), None)
     for _, name, target, _ in jobs:
         _check_target(target, FORMATS[name], path, force, capture)
     motions, notes = _motions(people, smoothed, ", ".join(name for name, form in chosen.items() if form.holds))
-    written, refused = list[Path](), list[TkError]()
+    written, failed, refused = list[Path](), dict[str, str](), list[TkError]()
     for person, name, target, write in jobs:
         if name not in failed and person.person in motions:
             try:
-                _write(motions[person.person], target, write)
+                note = _write(motions[person.person], target, write)
                 written.append(target)
+                notes += [f"{target}: {note}"] if note else []
             except TkError as error:
                 failed[name] = str(error)
                 refused.append(error)
@@ -165,13 +159,14 @@ def _number(person: Result, people: Sequence[Result]) -> str:
     return f"_{person.person}" if len(people) > 1 else ""
 
 
-def _write(motion: Motion, target: Path, write: Writer) -> None:
-    """Write to a temporary file and rename it, so that a file with the final name is complete."""
+def _write(motion: Motion, target: Path, write: Writer) -> str | None:
+    """Write to a temporary file and rename it, so that a file with the final name is complete; return the note."""
     with replacing(target) as part:
         target.parent.mkdir(parents=True, exist_ok=True)
-        write(motion, part)
+        note = write(motion, part)
         if target.is_dir():  # a rename does not replace a folder
             _remove(target)
+    return note
 
 
 def _remove(folder: Path) -> None:

@@ -1,100 +1,132 @@
-"""Write C3D files, the format of motion laboratories, with points and segment rotations. It needs ezc3d.
+"""Write C3D files, the format of motion laboratories, with points and segment rotations; see https://www.c3d.org.
 
 World frame of the result, millimetres. A point's residual is its standard deviation in whole millimetres, at most 127;
-0 if the result has none. In unknown frames the residual is -1 and the coordinates are 0, the format's mark of a missing
-point. ROTATION is each segment's 4×4 transform to the world; in unknown frames its reliability is -1.
+0 if the result has none. It is written in both bytes of the fourth word, because readers disagree: the format has it in
+the lower one, ezc3d up to 1.7 in the upper one, where the format has a mask of cameras. In unknown frames the word is
+-1 and the coordinates are 0, the format's mark of a missing point. ROTATION, an extension, is each segment's 4×4
+transform to the world; in unknown frames it is NaN and its reliability -1.
+
+Frames have their numbers in the recording, from 1: in the header, whose numbers have 16 bits, and in the parameters
+TRIAL:ACTUAL_START_FIELD and ACTUAL_END_FIELD, whose numbers have 32 bits. A file of more than 65,535 frames has no
+rotations: ezc3d reads all frames of such a file only if points are its only data.
 """
 
 from __future__ import annotations
 
-import os
 import struct
-import tempfile
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from tk.export.motion import Motion
 from tk.model.body.joints import SEGMENT_ORIGIN
 
-# The residual is a signed byte: ezc3d would wrap 256 to 0, a point without error.
-_MOST_RESIDUAL = 127
-# Of the format: bytes in a block, the place of the first data block's number in the header, the largest number that all
-# readers take, because some read it as signed.
-_BLOCK, _HEADER_DATA_START, _LAST_BLOCK = 512, 16, 32767
+_MOST_RESIDUAL, _BOTH_BYTES = 127, 257  # a signed byte; the factor that repeats it
+_BLOCK = 512  # bytes
+_MOST = 65535  # of 16 bits: numbers of frames and of blocks
+_MOST_SIGNED = 32767  # numbers of blocks that all readers take, because some read them as signed
+_MOST_PARAMETERS = 255  # blocks
+# The first bytes of the header and of the parameters; the last byte means little-endian numbers.
+_HEADER_KEY, _PARAMETER_KEY, _PROCESSOR = bytes([2, 80]), bytes([1, 80]), 84
 
 
-def write_c3d(motion: Motion, path: Path) -> None:
-    """Write the joints, the points of the feet and the segments."""
-    import ezc3d
+def write_c3d(motion: Motion, path: Path) -> str | None:
+    """Write the joints, the points of the feet and the segments.
 
-    file = ezc3d.c3d()
-    points = np.ones((4, len(motion.point_names), len(motion)))
-    points[:3] = 1000.0 * motion.points.transpose(2, 1, 0)
-    points[:3, :, ~motion.known] = np.nan  # ezc3d writes zeros
-    residuals = np.round(1000.0 * np.nan_to_num(motion.sigma.T)).clip(max=_MOST_RESIDUAL)
-    residuals[:, ~motion.known] = -1.0
-    file["data"]["points"] = points
-    file["data"]["meta_points"]["residuals"] = residuals[None]
-    file.add_parameter("POINT", "LABELS", list(motion.point_names))
-    file.add_parameter("POINT", "UNITS", ["mm"])
-    file.add_parameter("POINT", "RATE", [motion.fps])
-
-    T = np.zeros((4, 4, len(motion.segments), len(motion)))
-    T[3, 3] = 1.0
-    T[:3, :3] = motion.rotations.transpose(2, 3, 1, 0)
-    for s, name in enumerate(motion.segments):
-        T[:3, 3, s] = 1000.0 * motion.point(SEGMENT_ORIGIN[name]).T
-    T[:, :, :, ~motion.known] = np.nan
-    file["data"]["rotations"] = T
-    file.add_parameter("ROTATION", "LABELS", list(motion.segments))
-    file.add_parameter("ROTATION", "RATE", [motion.fps])
-    path.write_bytes(_rotations_first(_bytes_of(file)))
-
-
-def _bytes_of(file: Any) -> bytearray:
-    """Return the bytes that ezc3d writes. It does not report a full disk, so it writes to memory."""
-    handle = os.memfd_create("c3d")
-    with os.fdopen(handle, "rb") as memory, tempfile.TemporaryDirectory() as folder:
-        link = Path(folder, "memory.c3d")  # ezc3d adds the suffix where it is missing
-        link.symlink_to(f"/proc/self/fd/{handle}")
-        file.write(str(link))
-        return bytearray(memory.read())
-
-
-def _rotations_first(data: bytearray) -> bytes:
-    """Return a file of ezc3d with the data sections of points and rotations exchanged.
-
-    Readers that do not know rotations expect nothing after the points, and warn of bytes that are left over.
+    Returns:
+        A note if the segments are omitted.
     """
-    places = _parameters(data)
-    begins = [places[group, "DATA_START"] for group in ("POINT", "ROTATION")]
-    first, second = (struct.unpack_from("<H", data, begin)[0] for begin in begins)
-    points, rotations = data[_BLOCK * (first - 1) : _BLOCK * (second - 1)], data[_BLOCK * (second - 1) :]
-    rotations += bytes(-len(rotations) % _BLOCK)
-    start = first + len(rotations) // _BLOCK
-    if start > _LAST_BLOCK:
-        return bytes(data)
-    for place, block in ((begins[0], start), (begins[1], first), (_HEADER_DATA_START, start)):
-        struct.pack_into("<H", data, place, block)
-    return bytes(data[: _BLOCK * (first - 1)] + rotations + points)
+    count, first, used = len(motion), int(motion.result.frames[0]) + 1, len(motion.point_names)
+    groups = {
+        "POINT": {
+            "USED": _integer(used),
+            "FRAMES": _integer(min(count, _MOST)),
+            "SCALE": _float(-1.0),  # negative: coordinates are 32-bit floats
+            "RATE": _float(motion.fps),
+            "UNITS": _texts(["mm"]),
+            "LABELS": _texts(motion.point_names),
+        },
+        "ANALOG": {"USED": _integer(0), "GEN_SCALE": _float(1.0), "RATE": _float(0.0)},
+        "TRIAL": {"ACTUAL_START_FIELD": _long(first), "ACTUAL_END_FIELD": _long(first + count - 1)},
+    }
+    data = {"POINT": _points(motion)}
+    if is_long := count > _MOST:
+        groups["POINT"]["LONG_FRAMES"] = _float(count)
+    else:
+        rotations = _rotations(motion)
+        groups["ROTATION"] = {
+            "USED": _integer(len(motion.segments)),
+            "RATIO": _integer(1),
+            "RATE": _float(motion.fps),
+            "LABELS": _texts(motion.segments),
+        }
+        # readers that do not know rotations expect nothing after the points
+        fits = len(rotations) < _BLOCK * (_MOST_SIGNED - _MOST_PARAMETERS)
+        data = {"ROTATION": rotations, **data} if fits else {**data, "ROTATION": rotations}
+        data = {name: values + bytes(-len(values) % _BLOCK) for name, values in data.items()}
+    for name in data:
+        groups[name]["DATA_START"] = _integer(0)
+    starts, start = {}, 2 + len(_section(groups)) // _BLOCK
+    for name, values in data.items():
+        groups[name]["DATA_START"], starts[name] = _integer(start), start
+        start += len(values) // _BLOCK
+    begin = first if first <= _MOST else 1
+    end = min(begin + count - 1, _MOST)
+    header = struct.pack("<HHHHHfHHf", used, 0, begin, end, 0, -1.0, starts["POINT"], 0, motion.fps)
+    path.write_bytes(b"".join([(_HEADER_KEY + header).ljust(_BLOCK, b"\0"), _section(groups), *data.values()]))
+    return f"the segments' transforms are omitted: beside them, readers find only {_MOST} frames" if is_long else None
 
 
-def _parameters(data: bytearray) -> dict[tuple[str, str], int]:
-    """Return the place of the value of each scalar parameter, by the names of its group and its own."""
-    names: dict[int, str] = {}
-    found: dict[tuple[int, str], int] = {}
-    at = _BLOCK * (data[0] - 1) + 4
-    while data[at]:
-        length, group = struct.unpack_from("bb", data, at)
-        end = at + 2 + abs(length)  # negative: locked
-        name, following = data[at + 2 : end].decode(), struct.unpack_from("<H", data, end)[0]
-        if group < 0:
-            names[-group] = name
-        else:
-            found[group, name] = end + 4  # after the offset, the type and the number of dimensions
-        if not following:
-            break
-        at = end + following
-    return {(names[group], name): place for (group, name), place in found.items()}
+def _points(motion: Motion) -> bytes:
+    """Return x, y, z and the residual, by frame and point."""
+    values = np.empty((len(motion), len(motion.point_names), 4), "<f4")
+    values[..., :3] = 1000.0 * motion.points
+    values[..., 3] = _BOTH_BYTES * np.round(1000.0 * np.nan_to_num(motion.sigma)).clip(max=_MOST_RESIDUAL)
+    values[~motion.known] = (0.0, 0.0, 0.0, -1.0)
+    return values.tobytes()
+
+
+def _rotations(motion: Motion) -> bytes:
+    """Return the transform, column by column, and the reliability by frame and segment."""
+    values = np.zeros((len(motion), len(motion.segments), 17), "<f4")
+    for column in range(3):
+        values[..., 4 * column : 4 * column + 3] = motion.rotations[..., column]
+    for s, name in enumerate(motion.segments):
+        values[:, s, 12:15] = 1000.0 * motion.point(SEGMENT_ORIGIN[name])
+    values[..., 15] = 1.0
+    values[~motion.known] = np.nan
+    values[~motion.known, :, 16] = -1.0
+    return values.tobytes()
+
+
+def _section(groups: dict[str, dict[str, bytes]]) -> bytes:
+    """Return the blocks of the parameters, by group and name."""
+    entries = b""
+    for number, (group, parameters) in enumerate(groups.items(), 1):
+        entries += struct.pack("<bb", len(group), -number) + group.encode() + struct.pack("<HB", 3, 0)
+        for name, value in parameters.items():
+            # the way to the next entry, and no description
+            entries += struct.pack("<bb", len(name), number) + name.encode() + struct.pack("<H", len(value) + 3)
+            entries += value + b"\0"
+    blocks = -(-(4 + len(entries) + 2) // _BLOCK)
+    return (_PARAMETER_KEY + bytes([blocks, _PROCESSOR]) + entries).ljust(blocks * _BLOCK, b"\0")
+
+
+def _integer(number: int) -> bytes:
+    """Return a parameter of 16 bits: type, number of dimensions, value."""
+    return struct.pack("<bBH", 2, 0, number)
+
+
+def _long(number: int) -> bytes:
+    """Return a parameter of two numbers of 16 bits, the lower bits first."""
+    return struct.pack("<bBBI", 2, 1, 2, number)
+
+
+def _float(number: float) -> bytes:
+    return struct.pack("<bBf", 4, 0, number)
+
+
+def _texts(texts: Sequence[str]) -> bytes:
+    width = max(map(len, texts))
+    return struct.pack("<bBBB", -1, 2, width, len(texts)) + b"".join(text.encode().ljust(width) for text in texts)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from tk.export.motion import Motion
-from tk.model.body.angles import ANGLES, joint_angles
+from tk.model.body.angles import ANGLES, UNMEASURED, joint_angles
 
 
 def write_points_csv(motion: Motion, path: Path) -> None:
@@ -24,9 +24,14 @@ def write_points_csv(motion: Motion, path: Path) -> None:
                 writer.writerow((*start, name, *position, f"{motion.sigma[f, p]:.6f}" if has_sigma else ""))
 
 
-def write_angles_csv(motion: Motion, path: Path) -> None:
-    """Write ``frame,time,status,joint,angle,degrees`` for :data:`tk.model.body.angles.ANGLES`; blank if unknown."""
-    degrees = joint_angles(motion.rotations, motion.T_world_body, motion.segments)
+def write_angles_csv(motion: Motion, path: Path) -> str | None:
+    """Write ``frame,time,status,joint,angle,degrees`` for :data:`tk.model.body.angles.ANGLES`; blank if unknown.
+
+    Returns:
+        A note that names the angles that are blank in every frame.
+    """
+    pose_names = motion.result.meta.pose_names
+    degrees = joint_angles(motion.rotations, motion.T_world_body, motion.segments, pose_names)
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream)
         writer.writerow(("frame", "time", "status", "joint", "angle", "degrees"))
@@ -34,7 +39,10 @@ def write_angles_csv(motion: Motion, path: Path) -> None:
             start = _start(motion, f)
             for angles in ANGLES:
                 for name, value in zip(angles.names, degrees[angles.joint][f], strict=True):
-                    writer.writerow((*start, angles.joint, name, f"{value:.4f}" if motion.known[f] else ""))
+                    is_known = motion.known[f] and np.isfinite(value)
+                    writer.writerow((*start, angles.joint, name, f"{value:.4f}" if is_known else ""))
+    blank = [f"{angles.joint} {name}" for angles in ANGLES for name in angles.unmeasured(pose_names)]
+    return f"blank: {', '.join(blank)}: {UNMEASURED}" if blank else None
 
 
 def _start(motion: Motion, f: int) -> tuple[str, str, str]:

@@ -3,7 +3,8 @@
 The mesh has a primitive, with a material, for each segment; every vertex follows the node of its segment.
 
 Axes, units and rest pose are those of :mod:`tk.export.tree` and of glTF. An unknown frame repeats the last known pose;
-`asset.extras.lost_frames` of the file lists these frames.
+`asset.extras` of the file has these frames, `lost_frames`, and the number and the time of the first frame in the
+recording, `first_frame` and `first_time`; the animation begins at 0.
 """
 
 from __future__ import annotations
@@ -73,7 +74,11 @@ def write_glb(motion: Motion, path: Path) -> None:
         "asset": {
             "version": "2.0",
             "generator": f"tk {__version__}",
-            "extras": {"lost_frames": motion.result.frames[~motion.known].tolist()},
+            "extras": {
+                "first_frame": int(motion.result.frames[0]),
+                "first_time": float(motion.result.time[0]),
+                "lost_frames": motion.result.frames[~motion.known].tolist(),
+            },
         },
         "scene": 0,
         "scenes": [{"nodes": [0]}],

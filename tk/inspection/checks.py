@@ -21,10 +21,11 @@ from tk.evaluation.joints import plain_values
 from tk.inspection.leveling import Leveling, find_up
 from tk.inspection.people import PeopleWatch, PersonReport, many_people
 from tk.io.captures.capture import Capture
+from tk.io.captures.video import odd_turn
 from tk.kernels.mask_values import PERSON
 from tk.model.body.plausibility import fits_height
 from tk.model.cameras.common_view import sample_box, views_of
-from tk.model.cameras.up import up_vector
+from tk.model.cameras.up import shown_up, up_vector
 from tk.model.cameras.volume import Volume
 from tk.model.hull.coarse import Hull
 from tk.model.masks.image_health import MOST_SHIFT, ImageHealth, Sampled, contradiction, sampled
@@ -45,7 +46,8 @@ Masks = NDArray[np.uint8]
 # treadmill-slow (half the value names two cameras more, twice the value one fewer).
 #: frames that are compared; frames whose neighbours, LARGEST_DELAY before and after, are also compared
 _FRAMES, _DELAY_FRAMES = 10, 5
-#: frames from the start of the capture that are read: videos are decoded in order, so later frames take longer
+#: frames that are read, from the first one that all cameras have: videos are decoded in order, so later frames take
+#: longer
 _SPAN = 600
 #: a video is delayed if shifting it reduces the share of its masks outside the hull to less than this share of itself,
 #: and that share without a shift is larger than the second value
@@ -67,6 +69,8 @@ class CameraReport:
         empty, cut: shares of the frames without a person, and with a person at the edge of the image.
         outside: share of its masks outside the hull of the other cameras.
         shift_px: smallest shift that moves its masks into that hull, pixels; NaN if none does.
+        pairs_px: error of its outlines in pairs with the others that are not wrong, median, pixels; NaN if no pair can
+            be tested.
         late_frames: frames by which its video starts late: its frame k shows what frame k + late of the others shows.
         bad_images: number of frames whose image is blank, frozen or moved.
         verdict: what is wrong, in words; empty if nothing is.
@@ -80,6 +84,7 @@ class CameraReport:
     cut: float
     outside: float
     shift_px: float
+    pairs_px: float
     late_frames: int
     bad_images: int
     verdict: str
@@ -126,20 +131,20 @@ class Inspection:
             f"{self.with_hull:.0%} of them have a visual hull; length of the person {self.extent_m:.2f} m",
             "",
             f"{'camera':12} {'mask':>6} {'specks':>7} {'holes':>6} {'empty':>6} {'cut':>5} {'outside':>8} "
-            f"{'shift':>9} {'late':>5}",
+            f"{'shift':>7} {'pairs':>7} {'late':>5}",
         ]
         for c in self.cameras:
-            shift = f"{c.shift_px:.0f} px" if np.isfinite(c.shift_px) else "?"
+            shift, pairs = (f"{px:.0f} px" if np.isfinite(px) else "?" for px in (c.shift_px, c.pairs_px))
             outside = f"{c.outside:.1%}" if np.isfinite(c.outside) else "-"
             lines.append(
                 f"{c.name:12} {c.area:6.1%} {c.specks:7.1%} {c.holes:6.1%} {c.empty:6.0%} {c.cut:5.0%} {outside:>8} "
-                f"{shift:>9} {c.late_frames:5d}"
+                f"{shift:>7} {pairs:>7} {c.late_frames:5d}"
             )
         lines += [
             "",
             f"volume: all cameras see {self.seen_by_all:.0%} of it, at least two see {self.seen_by_two:.0%}; "
             f"{self.at_border:.1%} of the person is at its border",
-            f"up: {self.leveling.up}, {self.leveling.how}",
+            f"up: {shown_up(self.leveling.up)}, {self.leveling.how}",
             f"floor: {self.leveling.floor_m:+.2f} m along up"
             if np.isfinite(self.leveling.floor_m)
             else "floor: not found",
@@ -179,11 +184,13 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
     Raises:
         CaptureError: the capture cannot be read.
     """
-    span = min(capture.frame_count, _SPAN)
-    frames = np.unique(np.linspace(0, span - 1, _FRAMES).round().astype(int))
-    last = max(span - 1 - LARGEST_DELAY, span // 4)
-    centers = np.unique(np.linspace(span // 4, last, _DELAY_FRAMES).round().astype(int)).tolist()
-    near = {i + s for i in centers for s in range(-LARGEST_DELAY, LARGEST_DELAY + 1)} & set(range(span))
+    first = capture.first_frame  # before it, a camera that begins later shows its first image
+    span = range(first, min(capture.frame_count, first + _SPAN))
+    frames = np.unique(np.linspace(first, span[-1], _FRAMES).round().astype(int))
+    quarter = first + len(span) // 4
+    last = max(span[-1] - LARGEST_DELAY, quarter)
+    centers = np.unique(np.linspace(quarter, last, _DELAY_FRAMES).round().astype(int)).tolist()
+    near = {i + s for i in centers for s in range(-LARGEST_DELAY, LARGEST_DELAY + 1)} & set(span)
     kept = frames[np.linspace(0, len(frames) - 1, min(pictures, len(frames))).round().astype(int)]
     read = _read(capture, config, span, near | set(frames.tolist()), set(kept.tolist()))
     notes, small, masks = read.notes, read.small, read.masks
@@ -235,7 +242,9 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
         for i in kept.tolist()
     ]
     moved = [line for i in kept[:1] for line in _moved_since_empty(capture, read.images[int(i)], masks[int(i)])]
-    findings = [*moved, *_findings(inspection, capture, agreement), *many_people(people, entered)]
+    findings = [*moved, *_findings(inspection, capture, agreement)]
+    if not agreement.wrong:  # a wrong camera makes one person look like several
+        findings += many_people(people, entered)
     return replace(inspection, findings=tuple([unrelated, *findings] if unrelated else findings)), seen
 
 
@@ -259,14 +268,14 @@ class _Read:
     notes: list[str]
 
 
-def _read(capture: Capture, config: Settings, span: int, compared: set[int], kept: set[int]) -> _Read:
-    """Decode and segment the first ``span`` frames; return the masks of the frames that are ``compared``, and the
+def _read(capture: Capture, config: Settings, span: range, compared: set[int], kept: set[int]) -> _Read:
+    """Decode and segment the frames of ``span``; return the masks of the frames that are ``compared``, and the
     images of those that are ``kept``."""
     notes = list(capture.warnings)
     label = make_labeller(Task.of(capture, config), notes.append)
     read = _Read({}, {}, {}, tuple({} for _ in capture.rig), PeopleWatch(capture, span), notes)
     health = ImageHealth()
-    with capture.frames(0, span) as reader:
+    with capture.frames(span.start, span.stop) as reader:
         for frame in reader:
             i, watched = frame.index, read.watch.wants(frame.index)
             if not watched and i not in compared:
@@ -298,7 +307,7 @@ def _delays(
     compare: MaskAgreement, masks: dict[int, Masks], centers: Sequence[int], agreement: Agreement
 ) -> tuple[NDArray[np.int64], bool]:
     """Return the delay of each camera (C,) frames, the shift with which its masks lie in the hull of the others; and
-    whether it is certain: the same without any one of the frames (jackknife)."""
+    whether it is certain, see :func:`best_shift`."""
     C = len(compare.rig)
     small = {index: compare.small(m) for index, m in masks.items()}
     hulls = compare.hulls([compare.possible(masks[i]) for i in centers])
@@ -308,22 +317,34 @@ def _delays(
         best_shift(*_areas_by_shift(small, centers, hulls, [k for k in agreement.right if k != c], c, shifts))
         for c in range(C)
     ]
-    # a delayed camera also spoils the hulls for the others; the delayed one gains most from a shift
-    c = int(np.argmax([gain for _, gain, _ in found]))
+    # a delayed camera also spoils the hulls for the others, which then gain from a shift, too; only the shift of the
+    # delayed one makes all cameras agree
+    candidates = [c for c, (shift, *_) in enumerate(found) if shift]
+    if not candidates:
+        return late, True
+
+    def outside(c: int) -> float:
+        pairs = [(masks[i], masks[i + found[c][0]]) for i in centers if i + found[c][0] in masks]
+        this = np.arange(C)[:, None, None] == c
+        return compare.mean_outside([np.where(this, shifted, now) for now, shifted in pairs], agreement.right)
+
+    c = min(candidates, key=outside)
     late[c] = -found[c][0]
     return late, found[c][2]
 
 
 def best_shift(outside: NDArray[np.float64], area: NDArray[np.float64]) -> tuple[int, float, bool]:
     """Return the shift that moves a camera's masks into the hull of the others, frames; by how much the share outside
-    falls; and whether the shift is the same without any one of the frames (jackknife). 0, 0.0 if none does.
+    falls; and whether it is the same, to a frame, and not 0, without any one of the frames (jackknife). 0, 0.0 if none
+    does.
 
     Args:
         outside, area: (N, S) area outside the hull and whole area, of N frames and shifts from -S // 2 to S // 2.
     """
     total = np.array([outside, area])
     result = _lowest(*total.sum(axis=1))
-    return *result, all(_lowest(*np.delete(total, k, axis=1).sum(axis=1))[0] == result[0] for k in range(len(area)))
+    rest = [_lowest(*np.delete(total, k, axis=1).sum(axis=1))[0] for k in range(len(area))]
+    return *result, all(abs(shift - result[0]) <= 1 and np.sign(shift) == np.sign(result[0]) for shift in rest)
 
 
 def _lowest(outside: NDArray[np.float64], area: NDArray[np.float64]) -> tuple[int, float]:
@@ -389,7 +410,8 @@ def _camera(
             f"{max(late, 0)} of the others shows"
         )
     elif c in agreement.wrong:
-        verdict = agreement.reason(c)
+        turn = odd_turn(capture.clips[c], capture.clips)
+        verdict = agreement.reason(c) + (f"; {turn}" if turn else "")
     return CameraReport(
         name=camera.name,
         area=float(np.mean([m.mean() for m in own])),
@@ -399,6 +421,7 @@ def _camera(
         cut=cut / len(own),
         outside=float(agreement.outside[c]),
         shift_px=float(np.hypot(*agreement.shift_px[c])),
+        pairs_px=float(agreement.pairs_px[c]),
         late_frames=late,
         bad_images=len(bad_images),
         verdict=verdict,
@@ -459,7 +482,8 @@ def _findings(found: Inspection, capture: Capture, agreement: Agreement) -> list
     tilt = np.degrees(np.arccos(np.clip(capture.up_axis @ up_vector(found.leveling.up), -1.0, 1.0)))
     if tilt > _TILTED_DEG:
         lines.append(
-            f"up = {capture.up} differs by {tilt:.0f}° from the estimate from cameras and person, {found.leveling.up}: "
+            f"up = {shown_up(capture.up)} differs by {tilt:.0f}° from the estimate from cameras and person, "
+            f"{shown_up(found.leveling.up)}: "
             "tk level writes the estimate to capture.toml"
         )
     return lines

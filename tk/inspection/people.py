@@ -87,7 +87,7 @@ class PeopleWatch:
 
     Args:
         capture: the capture.
-        span: number of frames from the start that are looked at.
+        span: frames that are looked at.
 
     Attributes:
         entered: frame of the first look in which the working volume was not empty; 0 if it is the first of all, None
@@ -95,11 +95,11 @@ class PeopleWatch:
             as in `tk track`; then come those who enter it later, in this order, and last those who never do.
     """
 
-    def __init__(self, capture: Capture, span: int) -> None:
+    def __init__(self, capture: Capture, span: range) -> None:
         self._capture = capture
         self._finder = PeopleFinder(capture.rig, capture.volume, capture.up)
-        self._start = capture.init_frame if capture.init_frame < span else 0
-        self._every = max(1, round(capture.fps / _LOOKS_HZ), -(-(span - self._start) // _MOST_LOOKS))
+        self._start = capture.init_frame if capture.init_frame in span else span.start
+        self._every = max(1, round(capture.fps / _LOOKS_HZ), -(-(span.stop - self._start) // _MOST_LOOKS))
         self._paths: list[_Path] = []
         self._open: list[_Path] = []
         self._looks = 0

@@ -96,11 +96,20 @@ def ensure_runtime() -> None:
     _break_stale_lock()
     with contextlib.suppress(ImportError, AttributeError):  # another Taichi
         shorten_notes(importlib.import_module("taichi.lang.ast.ast_transformer_utils"), ti.lang.kernel_impl)
-    _LOG.info("starting the kernels; compiling them for the first time takes some seconds")
+    first = not any(_cache_folder().glob("*.tic"))
+    _LOG.info(f"starting the kernels{'; compiling them for the first time takes some seconds' * first}")
     with contextlib.redirect_stdout(io.StringIO()):  # it prints a line at start at any log level
         ti.init(**options)
     # else the program and its threads are destroyed at the interpreter's end, in any order
     atexit.register(ti.reset)
+
+
+def _cache_folder() -> Path:
+    """Return the folder of Taichi's cache of compiled kernels; it need not exist."""
+    given = os.environ.get("TI_OFFLINE_CACHE_FILE_PATH", "")
+    with contextlib.suppress(AttributeError):  # another Taichi
+        given = given or ti.lang.impl.default_cfg().offline_cache_file_path
+    return Path(given)
 
 
 def _break_stale_lock() -> None:
@@ -108,11 +117,8 @@ def _break_stale_lock() -> None:
 
     Taichi never removes it: nothing would be cached any more, and every start would compile all kernels again.
     """
-    with contextlib.suppress(OSError, AttributeError):  # no lock, somebody else's folder, or another Taichi
-        folder = Path(
-            os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or ti.lang.impl.default_cfg().offline_cache_file_path
-        )
-        lock = folder / "ticache.lock"
+    with contextlib.suppress(OSError):  # no lock, or somebody else's folder
+        lock = _cache_folder() / "ticache.lock"
         if time.time() - lock.stat().st_mtime > _STALE_S:
             lock.unlink()
 

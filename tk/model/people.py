@@ -204,6 +204,10 @@ class PeopleFinder:
         unexplained = np.count_nonzero(self._unexplained(self._reduced(masks), people))
         return bool(unexplained <= max(1, len(masks) - 2))
 
+    def explain(self, masks: NDArray, people: Sequence[LocatedPerson]) -> bool:
+        """Return whether the people whom :meth:`find` has just found in masks leave little of each unexplained."""
+        return not self._unexplained(self._reduced(masks), people).any()
+
     def _unexplained(self, masks: Bool, people: Sequence[LocatedPerson]) -> Bool:
         """Return (C,) whether people leave much of a camera's mask, (C, h, w) reduced, unexplained."""
         left = masks & ~self._covered(people)

@@ -2,8 +2,8 @@
 
 Filled outlines show the fitted body (left limbs warm, right limbs cool, trunk and head green), lines and dots its
 joints; a dot's colour shows the joint's standard deviation. A result without a body shows joints only. Lost frames are
-grey with a red border. People after the first have one colour each. On contact sheets, white crosses show the ground
-truth, if the capture has it.
+grey with a red border. People after the first have one colour each. The image of a camera that was left out of a frame
+is dark, and its name is red. On contact sheets, white crosses show the ground truth, if the capture has it.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ Float = NDArray[np.float64]
 _GAP, _SHEET_ROWS = 6, 4  # pixels between the tiles of a sheet; frames of a sheet
 #: largest width of a video, pixels; smaller images are enlarged up to the second width
 WIDEST, _NARROWEST = 1280, 640
+_WARNING = (120, 120, 255)  # letters of a lost frame, and of a camera that was left out
 _ASPECT = 9 / 16  # largest height of all tiles together, as a share of the largest width
 
 
@@ -119,8 +120,10 @@ class Overlay:
             for xy in self._true(frame, camera) if truth else ():
                 draw_truth(tile, view.place(xy))
             tile[:20] = tile[:20] // 3
-            color = (120, 120, 255) if self.people.lost(row) else TEXT
-            write(tile, f"{camera.name}  frame {frame}  {self.people.state(row)}", 6, 14, color)
+            excluded = self._excluded(row, camera)
+            color = _WARNING if self.people.lost(row) or excluded else TEXT
+            name = f"{camera.name} LEFT OUT" if excluded else camera.name
+            write(tile, f"{name}  frame {frame}  {self.people.state(row)}", 6, 14, color)
             tiles.append(tile)
         return joined(tiles, axis=1)
 
@@ -139,6 +142,8 @@ class Overlay:
     ) -> None:
         """Fill a tile with a camera's image, and draw bodies and joints over it."""
         view.of_size(image.shape[1] / camera.width, image.shape[0] / camera.height).cut(image, tile)
+        if self._excluded(row, camera):
+            tile[...] = tile // 3
         far = [np.nanmean(np.linalg.norm(figure.joints[row] - camera.center, axis=1)) for figure, _ in people]
         for k in np.argsort(far)[::-1]:
             figure, colors = people[k]
@@ -147,6 +152,10 @@ class Overlay:
             draw_joints(tile, view.place(seen.joints), colors, figure.lost(row))
         if self.people.lost(row):
             draw_lost(tile)
+
+    def _excluded(self, row: int, camera: Camera) -> bool:
+        names = self.people.first.meta.residual_cameras
+        return camera.name in names and bool(self.people.left_out[row, names.index(camera.name)])
 
     def _true(self, frame: int, camera: Camera) -> list[Float]:
         return [camera.project(self._truth[frame])[0]] if frame in self._truth else []
@@ -179,15 +188,16 @@ class Overlay:
         return near if near.scale > self.grid.scale else whole
 
     def _name(self, tile: Image, row: int, camera: Camera) -> None:
-        """Write the camera's name and E_S into a corner."""
-        text = camera.name
+        """Write the camera's name and E_S, or that it was left out, into a corner."""
+        excluded = self._excluded(row, camera)
+        text = f"{camera.name} LEFT OUT" if excluded else camera.name
         names = self.people.first.meta.residual_cameras
         errors = [e[row, names.index(camera.name)] for e in self._errors if camera.name in names]
         known = [f"{100 * error:.0f}" for error in errors if np.isfinite(error)]
         text += f"  E_S {', '.join(known)} %" if known else ""
         label = tile[:18, : text_width(text) + 12]
         label[...] = label // 3
-        write(tile, text, 6, 13)
+        write(tile, text, 6, 13, _WARNING if excluded else TEXT)
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,10 @@ SEGMENT_COLORS = {
     for limb, hue_deg in _HUES_DEG.items()
     for segment, color in _shades(hue_deg, CHAINS.get(limb, _TRUNK)).items()
 }
+#: the colours of legends: of each side those of arm and leg, by their first segment
+SIDE_COLORS: dict[str, tuple[Color, ...]] = {
+    side: tuple(SEGMENT_COLORS[CHAINS[f"{limb}_{side[0]}"][0]] for limb in ("arm", "leg")) for side in ("left", "right")
+} | {"trunk, head": (SEGMENT_COLORS[_TRUNK[0]],)}
 # The other colours, by what they show. Appearance only.
 #: errors: the border of a lost frame, a finding, a mask outside the hull
 LOST = of_hue(0.0)

@@ -41,6 +41,16 @@ class People:
     def stage(self) -> Stage:
         return Stage.of(self)
 
+    @cached_property
+    def left_out(self) -> NDArray[np.bool_]:
+        """(F, C) whether a camera was left out of a frame, of everybody who has a pose in it; False in frames without a
+        pose. C is 0 if the result has no residual."""
+        known = [(person.has_pose, out) for person in self.results if (out := person.excluded) is not None]
+        if not known:
+            return np.zeros((len(self.first), 0), np.bool_)
+        out = np.all([out | ~posed[:, None] for posed, out in known], axis=0)
+        return np.asarray(out & np.any([posed for posed, _ in known], axis=0)[:, None])
+
     def lost(self, row: int) -> bool:
         """Return whether anybody is lost in a frame."""
         return any(figure.lost(row) and figure.there(row) for figure in self.figures)

@@ -15,6 +15,7 @@ from tk.evaluation.people import evaluate_people
 from tk.io.results.data import Result
 from tk.io.results.reader import joint_tracks, positions_at, read_people
 from tk.io.results.status import STATUS_MEANING, Status
+from tk.model.body.expected_error import in_cm, mean_range
 from tk.model.body.joints import BONE_ENDS, HINGES, JOINTS, LIMB_JOINTS, SEGMENTS
 from tk.model.cameras.camera import Rig
 from tk.render.figure import AROUND, Figure
@@ -23,6 +24,7 @@ from tk.render.palette import (
     LOST,
     LOST_BODY,
     SEGMENT_COLORS,
+    SIDE_COLORS,
     SIGMA_MOST_M,
     hexadecimal,
     person_color,
@@ -72,13 +74,15 @@ def describe(result: Result, rig: Rig | None = None, truth: Path | None = None) 
         "scene": _scene(people.stage, result.cameras.rig if result.cameras else rig),
         "joints": list(JOINTS),
         "cameras": list(meta.residual_cameras),
+        "leftOut": [int(count) for count in People(whole).left_out.sum(axis=0)],
         "objectiveKind": meta.objective_kind,
         "people": [
-            _person(person, figure, people.stage, error) | _counts(all_rows)
+            _person(person, figure, people.stage, error) | _figures(all_rows)
             for person, all_rows, figure, error in zip(people.results, whole, people.figures, errors, strict=True)
         ],
         "colors": {
             "segments": {name: hexadecimal(color) for name, color in SEGMENT_COLORS.items()},
+            "sides": {name: [hexadecimal(color) for color in colors] for name, colors in SIDE_COLORS.items()},
             "people": [hexadecimal(person_color(person.person)) for person in people.results],
             "lost": hexadecimal(LOST),
             "lostBody": hexadecimal(LOST_BODY),
@@ -110,20 +114,30 @@ def _person(result: Result, figure: Figure, stage: Stage, truth: dict[str, Any] 
             {"segment": carrying.index(solid.segment), "rings": packed(solid.divided.rings)} for solid in figure.solids
         ],
         "sigma": None if figure.sigma is None else packed(figure.sigma),
-        "expected": None if (expected := result.in_joint_order().expected_error) is None else packed(expected),
         "silhouetteError": None if (error := result.silhouette_error) is None else packed(error),
         "truth": truth,
         "objective": packed(result.objective),
         "angles": _angles(result, figure),
+        "unmeasured": [f"{joint.joint} {joint.unmeasured}" for joint in result.meta.angles if joint.unmeasured],
         "timing": _timing(result),
     }
 
 
-def _counts(person: Result) -> dict[str, int]:
-    """Return in how many frames a person is present, lost and suspect."""
+def _figures(person: Result) -> dict[str, Any]:
+    """Return in how many frames a person is present, lost and suspect, and the expected errors."""
     present = np.isfinite(person.joints).any(axis=(1, 2))
     lost, suspect = present & ~person.has_pose, person.status == Status.SUSPECT
-    return {"present": int(present.sum()), "lostCount": int(lost.sum()), "suspectCount": int(suspect.sum())}
+    counts = {"present": int(present.sum()), "lostCount": int(lost.sum()), "suspectCount": int(suspect.sum())}
+    mean = "" if (found := person.mean_error_range) is None else in_cm(found)
+    return counts | {"expectedMean": mean, "expected": _expected(person.in_joint_order())}
+
+
+def _expected(result: Result) -> list[str] | None:
+    """Return the range of the mean error of each joint (J,) over the frames with a pose; "" if unknown."""
+    if (expected := result.expected_error) is None:
+        return None
+    ranges = [mean_range(of_joint) for of_joint in expected[result.has_pose].T]
+    return ["" if found is None else in_cm(found) for found in ranges]
 
 
 def _on_floor(stage: Stage) -> Float:
@@ -151,18 +165,24 @@ def _scene(stage: Stage, rig: Rig | None) -> dict[str, Any]:
 
 
 def _angles(result: Result, figure: Figure) -> list[dict[str, Any]]:
-    """Return a panel per angle, with both sides in one. Flexion of elbows and knees has a standard deviation."""
+    """Return a panel per angle, with both sides in one. Flexion of elbows and knees has a standard deviation.
+
+    An angle that is NaN in every frame has no panel; the page gives `JointAngles.unmeasured` instead.
+    """
     panels: dict[str, dict[str, Any]] = {}
     for joint in result.meta.angles:
         side = joint.joint[-2:] if joint.joint.endswith(("_l", "_r")) else ""
         base = joint.joint.removesuffix(side)
         for column, name in enumerate(joint.names):
+            values = result.angles[joint.joint][:, column]
+            if joint.unmeasured and np.isnan(values).all():
+                continue
             title = f"{base} {name}".replace("_", " ")
             panel = panels.setdefault(
                 title, {"title": title[0].upper() + title[1:], "convention": joint.convention, "lines": []}
             )
             line: dict[str, Any] = {"side": {"_l": "left", "_r": "right", "": "middle"}[side]}
-            line |= {"values": packed(result.angles[joint.joint][:, column])}
+            line |= {"values": packed(values)}
             if name == "flexion" and joint.joint in HINGES and figure.sigma is not None:
                 line |= {
                     "sigma": packed(

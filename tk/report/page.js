@@ -29,6 +29,14 @@
 
   // --- header
   get("title").textContent = data.capture;
+  const others = data.people.slice(1).map((person, k) => [`Person ${person.number}`, [data.colors.people[k + 1]]]);
+  for (const [name, colors] of [...Object.entries(data.colors.sides), ...others]) {
+    const entry = document.createElement("span");
+    for (const color of colors) entry.append(document.createElement("i"));
+    entry.querySelectorAll("i").forEach((square, k) => { square.style.background = colors[k]; });
+    entry.append(` ${name}`);
+    get("key").append(entry);
+  }
   const when = data.created.slice(0, 16).replace("T", " ");
   get("subtitle").textContent = `${data.file} · ${data.frameCount} frames at ${short(data.fps)} Hz${data.step > 1 ? `, one of ${data.step} is shown` : ""} · method ${data.method} · ${data.software}${when ? ` · ${when} UTC` : ""}`;
   const line = (cells, kind = "td") => {
@@ -57,18 +65,29 @@
     const good = (values) => values.filter((_, row) => there[row] && !lost[row]);
     return {
       ...person, n, name: `Person ${person.number}`, color: data.colors.people[n], there, lost, good,
-      silhouetteError, sigma: person.sigma && unpack(person.sigma), expected: person.expected && unpack(person.expected),
+      silhouetteError, sigma: person.sigma && unpack(person.sigma),
       meanError: silhouetteError && Array.from({ length: count }, (_, row) => mean(Array.from(silhouetteError.subarray(row * C, row * C + C)).filter(isFinite))),
     };
   });
   const sum = (values) => values.reduce((a, b) => a + b, 0);
   const bad = sum(people.map((person) => person.lostCount + person.suspectCount)), all = sum(people.map((person) => person.present));
-  if (bad > 0.2 * all) get("title").textContent += `: ${bad} of ${all} frames are lost or suspect`;
+  // a camera counts as used if it was left out of less than half of the frames with a pose
+  const posed = Math.max(...people.map((person) => person.present - person.lostCount));
+  const leftOut = data.leftOut.map((frames, k) => ({ name: data.cameras[k], frames })).filter(({ frames }) => frames > 0);
+  const used = C - leftOut.filter(({ frames }) => 2 * frames > posed).length;
+  const headlines = [];
+  if (used < C) headlines.push(`${used} of ${C} cameras used`);
+  if (bad > 0.2 * all) headlines.push(`${bad} of ${all} frames are lost or suspect`);
+  if (headlines.length) get("title").textContent += `: ${headlines.join(", ")}`;
+  get("left-out").hidden = !leftOut.length;
+  get("left-out").textContent = `Left out: ${leftOut.map(({ name, frames }) => `${name} (${frames >= posed ? "all" : `${frames} of ${posed}`} frames)`).join(", ")}. The notes at the end of the page give the reasons.`;
+  const EXPECTED = "Distance of the raw joint positions from the anatomical joints, mean over joints and frames. It contains the constant offset of each joint in the body, "
+    + "which σ does not contain. The offset depends on the person: the range holds for 90 % of the people in recordings with known joints.";
   const figuresOf = (person) => [
     ["lost frames", String(person.lostCount), `of ${person.present}`, person.lostCount > 0],
     ["suspect frames", String(person.suspectCount), `of ${person.present}`, person.suspectCount > 0],
     ["E_S, median frame", person.meanError ? short(100 * quantile(person.good(person.meanError), 0.5)) : "", "%"],
-    ["expected error of a joint, median", person.expected ? short(100 * quantile(person.expected.filter((_, k) => person.there[Math.floor(k / J)] && !person.lost[Math.floor(k / J)]), 0.5)) : "", "cm"],
+    ["expected mean error of the joints", person.expectedMean.replace(" cm", ""), "cm", false, EXPECTED],
   ];
   if (several) {
     get("figures").remove();
@@ -82,10 +101,11 @@
     }
   } else {
     const [person] = people, total = person.timing.find(({ stage }) => stage === "total");
-    const figures = figuresOf(person).filter(([name, value]) => value && (value !== "0" || name !== "suspect frames"));
+    const figures = [["cameras used", String(used), `of ${C}`, used < C], ...figuresOf(person)].filter(([name, value]) => value && (value !== "0" || name !== "suspect frames") && (C || name !== "cameras used"));
     if (total) figures.push(["time per frame, mean", short(total.ms), "ms"]);
-    for (const [name, value, unit, isBad] of figures) {
+    for (const [name, value, unit, isBad, hint] of figures) {
       const box = make("div", "", isBad ? "bad" : ""), number = make("dd", value);
+      if (hint) box.title = hint;
       number.append(" ", make("small", unit));
       box.append(make("dt", name), number);
       get("figures").append(box);
@@ -103,10 +123,10 @@
       const fill = make("i"), track = make("span", "", "track"), number = make("span", "", "number");
       track.append(fill);
       box.append(make("span", name), track, number);
-      return (value, most, color) => {
+      return (value, most, color, missing = "–") => {
         fill.style.width = `${isFinite(value) ? Math.min(100, 100 * value / most) : 0}%`;
         if (color) fill.style.background = color;
-        number.textContent = isFinite(value) ? `${listed(value)} ${unit}` : "–";
+        number.textContent = isFinite(value) ? `${listed(value)} ${unit}` : missing;
       };
     });
     holder.append(box);
@@ -126,6 +146,8 @@
     }
   }
 
+  const silhouetteErrors = ({ silhouetteError }, row) => (silhouetteError ? Array.from(silhouetteError.subarray(row * C, row * C + C)) : []);
+
   function show(wanted) {
     const next = Math.min(Math.max(wanted, 0), count - 1);
     if (next === row) return;
@@ -139,7 +161,8 @@
       get("status", person.n).textContent = words[person.n];
       if (several) get("now-who", person.n).textContent = `${person.name}: ${words[person.n]}`;
       get("status", person.n).dataset.status = person.status[row];
-      person.errorBars.forEach((set, k) => set(100 * person.silhouetteError[row * C + k], person.mostError));
+      const errors = silhouetteErrors(person, row), missing = errors.some(isFinite) ? "left out" : "–";
+      person.errorBars.forEach((set, k) => set(100 * errors[k], person.mostError, "", missing));
       person.sigmaBars.forEach((set, k) => {
         const value = person.sigma[row * J + k];
         set(1000 * value, 1000 * data.colors.sigmaMost, isFinite(value) ? sigmaColor(data.colors, value) : "");
@@ -217,7 +240,7 @@
 
   // --- pictures
   get("pictures-text").textContent = data.pictures.length
-    ? "The tracked body over the images: left limbs warm, right limbs cool. Dots are joints, from pale yellow (small σ) to dark violet (σ of 5 cm or more). Click an image to go to its frame."
+    ? "The tracked body over the images: left limbs warm, right limbs cool, trunk and head green. The image of a camera that was left out is dark. Dots are joints, from pale yellow (small σ) to dark violet (σ of 5 cm or more). Click an image to go to its frame."
     : "No images: the report was made without the capture. tk report RESULT.h5 CAPTURE adds them.";
   for (const picture of data.pictures) {
     const figure = make("figure"), caption = make("figcaption"), button = make("button"), image = make("img");
@@ -257,7 +280,8 @@
     if (person.angles.length) {
       const banded = person.angles.some(({ lines }) => lines.some((line) => line.sigma));
       get("angles-text", n).textContent = "Degrees. Left warm, right cool. Point at a title to read its convention (ISB where it defines one). "
-        + (banded ? "Bands: ± one σ, computed from independent positions of the three joints; other angles have no σ." : "No σ is available.");
+        + (banded ? "Bands: ± one σ, computed from independent positions of the three joints; other angles have no σ." : "No σ is available.")
+        + person.unmeasured.map((text) => ` Not measured: ${text.replaceAll("_", " ")}.`).join("");
       for (const panel of person.angles) {
         charts.push(new Chart(get("angle-charts", n), {
           ...common, title: panel.title, unit: "°", hint: panel.convention, wraps: true, least: 20, digits: 1,
@@ -273,13 +297,13 @@
 
     if (sigma) {
       get("sigma-text", n).textContent = "One standard deviation of a joint position along one axis, mm; frames that are not lost. "
-        + "Expected error: distance to the true position, median, mm; it adds the constant offset that a joint of this kind had on rendered recordings.";
+        + "Expected error: distance of the raw position from the true one, mean over the frames; a range, because the constant offset of the joint, which σ does not contain, depends on the person.";
       get("sigma-table", n).append(line(["joint", "median", "90 %", "largest", "expected error"], "th"));
       data.joints.forEach((name, k) => {
         const values = good(column(sigma, J, k));
         get("sigma-table", n).append(line([
           joint(name), ...[0.5, 0.9, 1].map((share) => listed(1000 * quantile(values, share))),
-          listed(1000 * quantile(good(column(expected, J, k)), 0.5)),
+          expected[k],
         ]));
       });
     } else {

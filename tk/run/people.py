@@ -33,6 +33,7 @@ from tk.model.setup import Subject
 from tk.run.choice import chosen, matched, unknown
 from tk.run.identity import EXCHANGED, UNCLEAR, Contact, Contacts, outcome_of
 from tk.run.member import Member, Tracked, below
+from tk.run.one_person import really_there
 from tk.run.task import Task
 from tk.trackers.camera_monitor import CameraMonitor, spread_over
 from tk.trackers.protocol import Estimate, Observation, Tracker, sharing
@@ -154,6 +155,7 @@ class People:
         if entered:
             self._begin_in_any_pose()
         _LOG.info("finding the person in frame %d and fitting the body to %d frames", frame.index, len(opening))
+        found = really_there(self._finder, self._setup, opening, found)
         found = order_people(found, self._setup.volume, subjects[0].height_m, subjects[0].position)
         numbers = chosen(self._choice, found, subjects[0], self._note)
         alone = len(found) <= 1 and 0 in numbers

@@ -17,7 +17,6 @@ from tk.io.captures.keypoints import first_pose
 from tk.io.captures.source import Source
 from tk.io.results.data import JointAngles, ResultMeta
 from tk.io.settings_file import to_toml
-from tk.model.body.angles import ANGLES
 from tk.model.body.anthropometry import AVERAGE_BODY
 from tk.model.body.skeleton import SEGMENTS, build_skeleton
 from tk.model.cues.landmarks import LANDMARKS
@@ -159,7 +158,7 @@ class Plan:
             landmark_names=LANDMARKS if tracker.reports_sigma and sources_of_masks(task.source) else (),
             segment_names=SEGMENTS if tracker.has_segments else (),
             feet=tracker.has_segments,
-            angles=tuple(JointAngles(a.joint, a.names, a.convention) for a in ANGLES) if tracker.has_segments else (),
+            angles=JointAngles.of_body(tracker.pose_names) if tracker.has_segments else (),
             objective_kind=tracker.objective_kind,
         )
 

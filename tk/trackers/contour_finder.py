@@ -74,6 +74,7 @@ class ContourFinder:
         fps: frames per second.
         line_search: how edges are searched along the contours' normals.
         solver: scales and iterations of Gauss-Newton.
+        seed: seed of the random candidate poses of the limb search.
     """
 
     def __init__(
@@ -84,9 +85,10 @@ class ContourFinder:
         fps: float = 15.0,
         line_search: SearchSettings = LINE_SEARCH,
         solver: GaussNewtonSettings = SOLVER,
+        seed: int = 0,
     ) -> None:
         self.contours, self.line_search, self.solver = config, line_search, solver
-        self.rig, self.up, self.fps = rig, up, fps
+        self.rig, self.up, self.fps, self.seed = rig, up, fps, seed
         self.world = TrackerFrame.of(rig, up)
         self.views = Views(self.world.rig)
         self.screen, self.choice = (RayGrid(self.world.rig, rows) for rows in (SCREEN_ROWS, CHOICE_ROWS))
@@ -352,7 +354,7 @@ class ContourFinder:
         found = pose[None]
         if misplaced is not None:
             search = LimbSearch(self.body, self.limbs, evidence, settle, pose)
-            rng = np.random.default_rng([7, frame.index])
+            rng = np.random.default_rng([7, frame.index, self.seed])
             best = search.better(min(1, self.solver.scales - 1), misplaced, rng)
             if len(best):
                 found = np.concatenate([found, settle(best, (0,), None)])

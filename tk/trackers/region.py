@@ -120,7 +120,7 @@ class RegionTracker(ContourTracker):
     @classmethod
     def of(cls, setup: Setup, settings: Settings) -> RegionTracker:
         """Return a new tracker with the settings of this method."""
-        return cls(setup.rig, setup.up, settings.silhouette, settings.region, setup.fps)
+        return cls(setup.rig, setup.up, settings.silhouette, settings.region, setup.fps, settings.seed)
 
     def __init__(
         self,
@@ -129,8 +129,9 @@ class RegionTracker(ContourTracker):
         contours: SilhouetteSettings | None = None,
         config: RegionSettings | None = None,
         fps: float = 15.0,
+        seed: int = 0,
     ) -> None:
-        super().__init__(rig, up, contours or SilhouetteSettings(), fps)
+        super().__init__(rig, up, contours or SilhouetteSettings(), fps, seed=seed)
         self.config = config or RegionSettings()
         self._alive: list[Hypothesis] = []
         self._mean_posture: Float = np.zeros((len(JOINTS), 3))
@@ -525,7 +526,7 @@ class RegionTracker(ContourTracker):
 
     def with_cameras(self, rig: Rig) -> RegionTracker:
         """Return a tracker of the same body and colours with other cameras."""
-        fresh = RegionTracker(rig, self.up, self.contours, self.config, self.fps)
+        fresh = RegionTracker(rig, self.up, self.contours, self.config, self.fps, self.seed)
         fresh.take_body(self.body)
         fresh.view_m = self.view_m
         fresh.colors.restore(self.colors.state())

@@ -38,7 +38,7 @@ class SilhouetteTracker(ContourTracker):
     @classmethod
     def of(cls, setup: Setup, settings: Settings) -> SilhouetteTracker:
         """Return a new tracker with the settings of this method."""
-        return cls(setup.rig, setup.up, settings.silhouette, fps=setup.fps)
+        return cls(setup.rig, setup.up, settings.silhouette, fps=setup.fps, seed=settings.seed)
 
     def __init__(
         self,
@@ -48,8 +48,9 @@ class SilhouetteTracker(ContourTracker):
         line_search: SearchSettings = LINE_SEARCH,
         solver: GaussNewtonSettings = SOLVER,
         fps: float = 15.0,
+        seed: int = 0,
     ) -> None:
-        super().__init__(rig, up, config or SilhouetteSettings(), fps, line_search, solver)
+        super().__init__(rig, up, config or SilhouetteSettings(), fps, line_search, solver, seed)
         self.stages = tuple(f"scale_{i}" for i in reversed(range(solver.scales)))
         self._pose = self._previous = np.zeros(len(self.pose_names))
         self._lost_for = 0

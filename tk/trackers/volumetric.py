@@ -99,7 +99,7 @@ class VolumetricTracker:
         self.up = up
         self.rig = rig
         self.hull = VisualHull(rig, VoxelGrid.cover(volume, config.voxels))
-        self._finder = ContourFinder(rig, up, config.silhouette, fps)
+        self._finder = ContourFinder(rig, up, config.silhouette, fps, seed=config.seed)
         skeleton = build_skeleton(AVERAGE_BODY, up, paper=True)
         self.pose_names, self.pose_units = skeleton.names, skeleton.units
         self.skin: SuperellipsoidBody

@@ -184,7 +184,9 @@ def test_select_keeps_the_named_cameras(tmp_path: Path) -> None:
         ("cam_01", "cam_01", ["cam01", "cam02"], "cam01"),
         ("cam01", "x", ["cam-01"], "cam-01"),
         ("A", "cam_0", ["cam0"], "cam0"),  # the key, loosely
-        ("cam1", "cam1", ["Cam1", "cam11"], None),  # letters keep their case, digits count
+        ("cam1", "cam1", ["Cam 1", "cam11"], "Cam 1"),
+        ("cam1", "cam1", ["cam-1", "Cam1"], "cam-1"),  # the same case first
+        ("cam1", "cam1", ["cam11"], None),
         ("__", "_", ["--"], None),  # nothing left to compare
     ],
 )

@@ -466,3 +466,16 @@ def test_damaged_images_are_found_after_opening(copy: Path) -> None:
     (line,) = open_capture(copy).damaged(FRAMES, every)
     assert line.startswith(f"{path}: is damaged in ") and "copy it again" in line
     assert open_capture(copy).damaged(FRAMES, np.arange(len(every)) != 1) == []
+
+
+def test_printed_capture_has_a_few_lines(tiny: Path) -> None:
+    capture = open_capture(tiny)
+    lines = str(capture).splitlines()
+    assert lines == repr(capture).splitlines() and len(lines) == 4
+    assert lines[0] == f"Capture demo: {tiny}" and "cameras: cam1, cam2" in lines[1] and "(160×120)" in lines[1]
+    assert lines[2].startswith(f"{capture.frame_count} frames, 0 to {capture.frame_count - 1}, ")
+    assert lines[3] == "masks: from masks; up: z"
+    own = open_capture(tiny, masks="none")
+    assert str(own).endswith("masks: against the empty scene in background; up: z")
+    tilted = dataclasses.replace(capture, up="[-0.8993871328483293, 0.0, 0.4371528472941]")
+    assert str(tilted).endswith("up: [-0.899, 0.000, 0.437]")

@@ -104,7 +104,58 @@ def test_fps_that_contradicts_the_videos_is_refused(make_capture: MakeCapture) -
     write_toml(folder / "capture.toml", {"fps": 25.0, "volume": VOLUME})
     with refused(ClockError, folder / "capture.toml", "fps = 25", "cam1.mp4 has 15 frames/s", "remove fps"):
         open_capture(folder)
-    assert open_capture(folder, resample=True).fps == 25
+
+
+def test_slow_motion_is_read_at_the_rate_at_which_it_was_recorded(make_capture: MakeCapture) -> None:
+    folder = make_capture()
+    film(folder, cam1=15, cam2=15, cam3=15)
+    write_toml(folder / "capture.toml", {"fps": 60.0, "volume": VOLUME})
+    with refused(ClockError, "fps = 60", "15 frames/s", "slow motion", 'times = "fps"') as caught:
+        open_capture(folder)
+    assert caught.value.hint == ""  # resampling would leave three of four frames without an image
+    with refused(ClockError, "no camera has more than 15 frames/s", "fps = 60", 'times = "fps"'):
+        open_capture(folder, resample=True)
+    write_toml(folder / "capture.toml", {"fps": 60.0, "times": "fps", "volume": VOLUME})
+    capture = open_capture(folder)
+    assert (capture.fps, capture.frame_count, capture.warnings) == (60.0, 12, ())
+    assert shown(capture) == [[k, k, k] for k in range(12)]
+    assert open_capture(folder, resample=True).frame_count == 12
+
+
+def test_time_stamps_also_describe_slow_motion(make_capture: MakeCapture) -> None:
+    folder = make_capture()
+    film(folder, cam1=15, cam2=15, cam3=15)
+    write_toml(folder / "capture.toml", {"fps": 60.0, "volume": VOLUME})
+    write_times(folder, **{f"cam{k}": np.arange(12) / 60 for k in (1, 2, 3)})
+    assert open_capture(folder).fps == 60
+
+
+def test_times_by_fps_need_fps(make_capture: MakeCapture) -> None:
+    for settings, part in (({"times": "fps"}, "needs fps"), ({"times": "slow"}, "must be one of files, fps")):
+        folder = make_capture(settings=settings, name=part)
+        with refused(CaptureError, folder / "capture.toml", part):
+            open_capture(folder)
+
+
+def test_a_lower_rate_may_be_resampled(make_capture: MakeCapture) -> None:
+    folder = make_capture()
+    film(folder, cam1=30, cam2=30, cam3=30)
+    write_toml(folder / "capture.toml", {"fps": 15.0, "volume": VOLUME})
+    with pytest.raises(ClockError) as caught:
+        open_capture(folder)
+    assert "--resample" in caught.value.hint
+    assert shown(open_capture(folder, resample=True))[:12] == [[2 * k] * 3 for k in range(12)]
+
+
+def test_a_camera_that_drops_images_has_the_rate_of_its_intervals(make_capture: MakeCapture) -> None:
+    folder = make_capture()
+    kept = [k for k in range(30) if k % 10 != 5]
+    for camera in (1, 2, 3):
+        images = [picture(camera, k) for k in kept]
+        write_uneven_video(folder / "videos" / f"cam{camera}.mp4", images, [k / 30 for k in kept])
+    write_toml(folder / "capture.toml", {"fps": 30.0, "volume": VOLUME})
+    rows = shown(open_capture(folder, resample=True))
+    assert rows[:8] == [[k, k, k] if k != 5 else [None] * 3 for k in range(8)]
 
 
 @pytest.mark.parametrize("rates", [(30.0, 29.97, 30.0), (29.97, 29.97, 29.97), (30.0, 30.0, 30.0)])

@@ -486,13 +486,13 @@ def test_an_open_reader_does_not_block_the_exit(tmp_path: Path) -> None:
 def test_damaged_images_are_found_in_every_container(tmp_path: Path, name: str) -> None:
     path, rng = tmp_path / name, np.random.default_rng(0)
     write_video(path, [rng.integers(0, 255, (64, 96, 3), np.uint8) for _ in range(12)])
-    assert damaged_images(path, 12) == []
+    assert damaged_images(probe_video(path), 12) == []
     data = bytearray(path.read_bytes())
     for place in rng.integers(len(data) // 3, len(data) // 2, 200).tolist():
         data[place] ^= 0xFF
     path.write_bytes(data)
-    found = damaged_images(path, 12)
+    found = damaged_images(probe_video(path), 12)
     assert found and set(found) <= set(range(12))
     path.write_bytes(data[: 2 * len(data) // 3])
     if name.endswith("avi"):  # an MP4 that is cut off cannot be opened
-        assert set(damaged_images(path, 12)) <= set(range(12))
+        assert set(damaged_images(probe_video(path), 12)) <= set(range(12))

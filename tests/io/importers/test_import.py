@@ -195,8 +195,8 @@ def test_invalid_file_names_of_cameras_are_replaced(folder: Path, check: Import)
 def test_unsupported_video_format_is_named(folder: Path, check: Import) -> None:
     write_qca(folder / "session.qca.txt", make_rig())
     for name in CAMS:
-        (folder / f"{name}.mts").write_bytes(b"\x47")
-    with pytest.raises(VideoError, match=r"cam1.mts, cam2.mts, .* tk reads .mp4, .avi, .mov, .mkv; convert them"):
+        (folder / f"{name}.r3d").write_bytes(b"\x47")
+    with pytest.raises(VideoError, match=r"the folder holds cam1.r3d, cam2.r3d, .*; tk reads .mp4, .m4v, .mov"):
         import_project(folder, check.output)
 
 

@@ -40,7 +40,7 @@ def joint_rotation(joint: str, degrees: np.ndarray) -> np.ndarray:
     angles = BY_JOINT[joint]
     turns = np.zeros((*np.shape(degrees)[:-1], 3))
     for column, (_, k, sign) in enumerate(angles.columns):
-        turns[..., k] = sign * np.radians(degrees[..., column])
+        turns[..., k] = sign * np.radians(np.nan_to_num(degrees[..., column]))
     R = compose(angles.sequence, turns)
     R = MIRROR @ R @ MIRROR if angles.mirrored else R
     return FORWARD_UP_RIGHT.T @ R @ FORWARD_UP_RIGHT
@@ -53,7 +53,10 @@ def segment_rotations(skeleton: Skeleton, poses: np.ndarray) -> np.ndarray:
 def angles_of(pose: np.ndarray, skeleton: Skeleton = SKELETON) -> dict[str, dict[str, float]]:
     found = joint_angles(segment_rotations(skeleton, pose[None]), skeleton.T_world_body)
     names = {joint: angles.names for joint, angles in BY_JOINT.items()}
-    return {joint: dict(zip(names[joint], map(float, values[0]), strict=True)) for joint, values in found.items()}
+    return {
+        joint: {name: float(value) for name, value in zip(names[joint], values[0], strict=True) if np.isfinite(value)}
+        for joint, values in found.items()
+    }
 
 
 KNOWN = [
@@ -203,7 +206,25 @@ def test_ankles(side: str) -> None:
 
 def test_feet_that_ride_on_the_shins_have_no_angle() -> None:
     found = joint_angles(segment_rotations(SKELETON, pose_of()[None]), np.eye(3), SEGMENTS[:11])
-    np.testing.assert_array_equal(found["ankle_l"], [[0.0, 0.0]])
+    np.testing.assert_array_equal(found["ankle_l"], [[np.nan, np.nan]])
+
+
+@pytest.mark.parametrize("paper", [False, True])
+def test_angle_without_a_degree_of_freedom_is_nan(paper: bool) -> None:
+    """An angle is a number if and only if it differs between poses."""
+    skeleton = build_skeleton(BODY, paper=paper)
+    low, high = np.maximum(skeleton.lower, -1.0), np.minimum(skeleton.upper, 1.0)
+    R = segment_rotations(skeleton, np.random.default_rng(0).uniform(low, high, (9, len(low))))
+    missing = [(a.joint, *a.unmeasured(skeleton.names)) for a in ANGLES if a.unmeasured(skeleton.names)]
+    bent = [("lumbar", "flexion", "lateral_bending", "rotation")] * paper
+    ankles = [(f"ankle_{side}", "dorsiflexion", "inversion") for side in "lr"] * paper
+    assert sorted(missing) == sorted([*bent, ("neck", "rotation"), *ankles])
+    everything = joint_angles(R, skeleton.T_world_body)
+    for joint, degrees in joint_angles(R, skeleton.T_world_body, pose_names=skeleton.names).items():
+        unmeasured = np.isin(BY_JOINT[joint].names, BY_JOINT[joint].unmeasured(skeleton.names))
+        assert np.isnan(degrees[:, unmeasured]).all() and (np.ptp(degrees[:, ~unmeasured], axis=0) > 1).all()
+        if joint != "neck":
+            assert (np.abs(everything[joint][:, unmeasured]) < 1e-9).all()
 
 
 def test_standing_segments_are_aligned() -> None:

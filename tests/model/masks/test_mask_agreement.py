@@ -101,6 +101,18 @@ def test_turned_camera_is_the_only_wrong_one(masks: np.ndarray, camera: int, axi
         found = compare(masks, turned(RIG, camera, degrees, axis))
         assert found.wrong == (camera,) and found.refusal == ""
         assert "turned" in found.reason(camera)
+        assert np.nanargmax(found.pairs_px) == camera, "the table accuses the same camera"
+        shown = {f"off by {px:.0f} px" for px in (np.hypot(*found.shift_px[camera]), found.pairs_px[camera])}
+        assert any(text in found.reason(camera) for text in shown), "with a number of the table"
+
+
+def test_camera_that_is_wrong_in_pairs_only_has_their_error(masks: np.ndarray) -> None:
+    """The bulky hull of three cameras may have room for the masks of a turned one."""
+    cameras = [0, 1, 2, 3]
+    found = part(masks, cameras, turned(RIG, 3, 2.5, axis=0))
+    inside = replace(found, wrong=(3,), outside=np.zeros(4), shift_px=np.zeros((4, 2)))
+    assert np.nanargmax(inside.pairs_px) == 3 and inside.pairs_px[3] > 2 * np.delete(inside.pairs_px, 3).max()
+    assert f"off by {inside.pairs_px[3]:.0f} px" in inside.reason(3)
 
 
 def test_turned_camera_has_its_shift(masks: np.ndarray) -> None:

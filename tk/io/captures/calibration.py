@@ -257,20 +257,25 @@ def match_camera(name: str, key: str, stems: Iterable[str]) -> str | None:
     """Return the file stem of a camera; None if there is none.
 
     The stem equals the camera's ``name``, else its table's ``key``, else one of these up to characters that are no
-    letters and no digits (`cam_01` and `cam01`).
+    letters and no digits (`cam_01` and `cam01`), else up to these and the case of letters (`Cam 1` and `cam1`).
 
     Raises:
-        CaptureError: several stems match in the last sense.
+        CaptureError: several stems match in one of the last two senses.
     """
     stems = list(stems)
     for exact in (name, key):
         if exact in stems:
             return exact
-    bare = {_bare(name), _bare(key)} - {""}
-    close = [stem for stem in stems if _bare(stem) in bare]
-    if len(close) > 1:
-        raise CaptureError(f"camera {name!r} could be any of {', '.join(sorted(close))}; rename the files to the names")
-    return close[0] if close else None
+    for reduced in (_bare, lambda text: _bare(text).casefold()):
+        wanted = {reduced(name), reduced(key)} - {""}
+        close = [stem for stem in stems if reduced(stem) in wanted]
+        if len(close) > 1:
+            raise CaptureError(
+                f"camera {name!r} could be any of {', '.join(sorted(close))}; rename the files to the names"
+            )
+        if close:
+            return close[0]
+    return None
 
 
 def _bare(text: str) -> str:

@@ -17,19 +17,19 @@ from tk.errors import CaptureError, VideoError, VolumeError
 from tk.io.captures.calibration import Calibration, match_camera, read_calibration
 from tk.io.captures.capture_toml import CaptureSettings, GivenSubject, read_settings
 from tk.io.captures.clip import Clip, Image
-from tk.io.captures.clip_folder import list_clips, probe
+from tk.io.captures.clip_folder import list_clips, names_in, probe
 from tk.io.captures.frames import FrameReader, FrameSet
 from tk.io.captures.mobo import SETTINGS as MOBO_SETTINGS
 from tk.io.captures.mobo import find_walk, read_cameras
 from tk.io.captures.pictures import PictureClip, picture_number
 from tk.io.captures.timing import check_clock, read_stamps
 from tk.io.captures.timing import resample as resampled
-from tk.io.captures.video import VideoClip, damaged_images
+from tk.io.captures.video import VideoClip, as_calibrated, damaged_images, notes_on, odd_turn
 from tk.io.paths import text_of
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import infer_volume, sample_box, views_of
 from tk.model.cameras.mounting import infer_up
-from tk.model.cameras.up import up_vector
+from tk.model.cameras.up import shown_up, up_vector
 from tk.model.cameras.volume import Volume
 from tk.model.masks.image_health import described
 from tk.model.setup import Setup, Subject
@@ -62,7 +62,7 @@ DEFAULT_UP, _UP_DEG = "z", 25.0
 _FAR_APART_M = 100.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Capture:
     """An open capture folder, a :class:`~tk.io.captures.source.Source`. :meth:`frames` reads its images.
 
@@ -106,6 +106,23 @@ class Capture:
     time_offset_s: tuple[float, ...]
     segmenter: Segmenter | None = None
     subjects: tuple[GivenSubject, ...] = (GivenSubject(),)
+
+    def __repr__(self) -> str:
+        """Return folder, cameras, frames and masks, in four lines."""
+        by_size: dict[str, list[str]] = {}
+        for camera in self.rig:
+            by_size.setdefault(f"{camera.width}×{camera.height}", []).append(camera.name)
+        cameras = "; ".join(f"{', '.join(names)} ({size})" for size, names in by_size.items())
+        made = {"none": "against the empty scene in background", "median": "against the median image", "": "not given"}
+        masks = made.get(self.masks_from, f"from {self.masks_from}")
+        count = self.frame_count - self.first_frame
+        return (
+            f"Capture {self.name}: {self.path}\n"
+            f"{len(self.rig)} cameras: {cameras}\n"
+            f"{count} frames, {self.first_frame} to {self.frame_count - 1}, {count / self.fps:.1f} s at "
+            f"{self.fps:g} frames/s\n"
+            f"masks: {masks}; up: {shown_up(self.up)}"
+        )
 
     @property
     def late_frames(self) -> tuple[int, ...]:
@@ -168,13 +185,15 @@ class Capture:
 
     def damaged(self, stop: int, cameras: NDArray[np.bool_]) -> list[str]:
         """Return a line on each video of some cameras, (C,) bool, with images before frame ``stop`` that cannot be
-        decoded completely."""
+        decoded completely, or with another turn than most of the others."""
         lines = []
         for camera in np.flatnonzero(cameras).tolist():
             clip, late = self.clips[camera], self.late_frames[camera]
-            if isinstance(clip, VideoClip) and (bad := damaged_images(clip.path, min(stop - late, _CHECKED_IMAGES))):
+            if isinstance(clip, VideoClip) and (bad := damaged_images(clip, min(stop - late, _CHECKED_IMAGES))):
                 which = described(bad[0] + late, bad[-1] + late, len(bad))
                 lines.append(f"{clip.path}: is damaged in {which}; copy it again, or re-encode the original")
+            if turn := odd_turn(clip, self.clips):
+                lines.append(f"{clip.path}: {turn}")
         return lines
 
     @property
@@ -262,11 +281,11 @@ def open_capture(
     if walk and walk.masks is not None and masks == "auto":
         masks = str(walk.masks)
     mask_clips = _open_masks(calibration, path, masks)
-    warnings: list[str] = list(calibration.notes)
+    warnings: list[str] = [*calibration.notes, *notes_on(clips)]
     if settings.unknown:
         warnings.append(f"{path / 'capture.toml'}: unknown keys are ignored: {', '.join(settings.unknown)}")
     _warn_of_units(calibration, warnings.append)
-    stamps = read_stamps(path, calibration, clips)
+    stamps = read_stamps(path, calibration, clips, settings.fps if settings.times == "fps" else None)
     if resample:
         clips, mask_clips, fps = resampled(clips, mask_clips, stamps, settings.fps, warnings.append)
     else:
@@ -345,22 +364,25 @@ def _clips_of(
             raise VideoError(f"{folder}: {ambiguous}") from None
         if stem is None:
             expected = folder / (camera.name if folder.name == "images" else f"{camera.name}.{suffix}")
-            there = ", ".join(file.name for file in found.values()) or "nothing"
-            raise VideoError(f"{expected}: camera {camera.name!r} has no {what}; {folder.name}/ holds {there}")
+            raise VideoError(
+                f"{expected}: camera {camera.name!r} has no {what}; {folder.name}/ holds {names_in(folder)}"
+            )
         if stem in taken:
             raise VideoError(
                 f"{found[stem]}: fits both cameras {taken[stem].name!r} and {camera.name!r}; rename it to its camera"
             )
         taken[stem] = camera
     with ThreadPoolExecutor(os.cpu_count()) as threads:
-        clips = tuple(threads.map(lambda stem: probe(found[stem], is_mask), taken))
-    for clip, camera in zip(clips, taken.values(), strict=True):
-        if (clip.width, clip.height) != (camera.width, camera.height):
+        clips = list(threads.map(lambda stem: probe(found[stem], is_mask), taken))
+    for k, (clip, camera) in enumerate(zip(clips, taken.values(), strict=True)):
+        size = camera.width, camera.height
+        clip = clips[k] = as_calibrated(clip, size)
+        if (clip.width, clip.height) != size:
             raise VideoError(
                 f"{clip.path}: is {clip.width}×{clip.height}, but {calibration.path.name} gives camera {camera.name!r} "
                 f"{camera.width}×{camera.height}; calibrate for this size or scale the pictures"
             )
-    return clips
+    return tuple(clips)
 
 
 def _common_length(clips: Sequence[Clip], late: Sequence[int], warn: Callable[[str], None]) -> int:
@@ -390,7 +412,7 @@ def _up(settings: CaptureSettings, rig: Rig, path: Path, warn: Callable[[str], N
     found = infer_up(rig)
     if up_vector(found.up) @ up_vector(DEFAULT_UP) > np.cos(np.radians(_UP_DEG)):
         return DEFAULT_UP
-    warn(f"{path / 'capture.toml'}: gives no up; {found.up} is taken, {found.how}; tk level looks closer")
+    warn(f"{path / 'capture.toml'}: gives no up; {shown_up(found.up)} is taken, {found.how}; tk level looks closer")
     return found.up
 
 

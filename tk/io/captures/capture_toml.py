@@ -16,6 +16,9 @@ from tk.model.cameras.volume import Volume
 #: known initialisation poses; "any": the subject may begin in any pose
 INIT_POSES = ("da-vinci", "any")
 
+#: what gives the times of images: time stamps, else the files; or `fps`, with files that play at another rate
+TIMES = ("files", "fps")
+
 #: range of the frame rate, 1/s: from one image in 100 s to the fastest cameras
 FPS_RANGE = (0.01, 1e5)
 
@@ -27,7 +30,7 @@ _KEYS: dict[str, tuple[str, ...]] = {
     "subject": ("height", "position", "body", "init"),
     "init": ("frame", "pose", "keypoints"),
 }
-_TOP_KEYS = ("name", "fps", "up", *_KEYS)
+_TOP_KEYS = ("name", "fps", "times", "up", *_KEYS)
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,7 @@ class CaptureSettings:
     Attributes:
         name: name of the capture.
         fps: frame rate, 1/s.
+        times: one of :data:`TIMES`.
         up: axis that points up in the world, as :func:`tk.model.cameras.up.up_text` writes it: "z", or a unit vector.
             None: inferred from the cameras.
         volume: the working volume, metres.
@@ -65,6 +69,7 @@ class CaptureSettings:
 
     name: str | None = None
     fps: float | None = None
+    times: str = "files"
     up: str | None = None
     volume: Volume | None = None
     subjects: tuple[GivenSubject, ...] = (GivenSubject(),)
@@ -91,6 +96,12 @@ def read_settings(path: Path) -> CaptureSettings:
     if fps is not None and not FPS_RANGE[0] <= fps <= FPS_RANGE[1]:
         document.fail(f"fps = {fps:g} must be between {FPS_RANGE[0]:g} and {FPS_RANGE[1]:g}")
 
+    times = document.text("times", "files")
+    if times not in TIMES:
+        document.fail(f"times = {times!r} must be one of {', '.join(TIMES)}")
+    if times == "fps" and fps is None:
+        document.fail('times = "fps" needs fps, the rate at which the videos were recorded')
+
     up = _up(document) if "up" in document else None
 
     init = document.table("init")
@@ -104,6 +115,7 @@ def read_settings(path: Path) -> CaptureSettings:
     return CaptureSettings(
         name=document.text("name", "") if "name" in document else None,
         fps=fps,
+        times=times,
         up=up,
         volume=_volume(document.table("volume")) if "volume" in document else None,
         subjects=_subjects(document),

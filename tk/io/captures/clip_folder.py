@@ -17,6 +17,12 @@ def probe(path: Path, is_mask: bool = False) -> Clip:
     return probe_video(path, is_mask)
 
 
+def names_in(folder: Path, most: int = 12) -> str:
+    """Return the names of what a folder holds, for a message."""
+    names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "") or "nothing"
+
+
 def list_clips(folder: Path, pictures: bool = False) -> dict[str, Path]:
     """Return the video files, folders of images and, with ``pictures``, single images in a folder, by stem.
 

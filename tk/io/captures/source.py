@@ -76,6 +76,6 @@ class Source(Protocol):
         ...
 
     def damaged(self, stop: int, cameras: NDArray[np.bool_]) -> Sequence[str]:
-        """Return a line on each of some cameras, (C,) bool, with damaged images before frame ``stop``. This may decode
-        all of their images again."""
+        """Return a line on each of some cameras, (C,) bool, with damaged images before frame ``stop``, or with another
+        reason in its file to contradict the others. This may decode all of their images again."""
         ...

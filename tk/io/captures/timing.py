@@ -1,6 +1,7 @@
 """When images were taken: time stamps of the cameras, contradictions between them, and frames of a common clock.
 
-The times are those of `timestamps/<camera>.csv`, else those in the video files. A camera's frame k is taken for the
+The times are those of `timestamps/<camera>.csv`, else those in the video files, or k / `fps` if `capture.toml` says so:
+the file of a video in slow motion gives the rate at which it is played. A camera's frame k is taken for the
 same moment as frame k of the others, so different rates are an error, unless the images are resampled.
 """
 
@@ -50,6 +51,11 @@ class Stamps:
         return float((len(self.seconds) - 1) / (self.seconds[-1] - self.seconds[0]))
 
     @property
+    def own_rate(self) -> float:
+        """Rate of the camera, 1/s, also where single images are missing."""
+        return max(self.fps, 1.0 / float(np.median(np.diff(self.seconds))))
+
+    @property
     def since_start(self) -> Float:
         """(N,) times on the common clock, else since the first image."""
         return self.seconds if self.common else self.seconds - self.seconds[0]
@@ -61,15 +67,18 @@ class Stamps:
         return float(np.abs(self.seconds - even).max() * self.fps)
 
 
-def read_stamps(folder: Path, calibration: Calibration, clips: Sequence[Clip]) -> tuple[Stamps | None, ...]:
-    """Return the times of each clip; None if nothing gives them.
+def read_stamps(
+    folder: Path, calibration: Calibration, clips: Sequence[Clip], regular: float | None
+) -> tuple[Stamps | None, ...]:
+    """Return the times of each clip; None if nothing gives them. ``regular``: without `timestamps/`, the images are
+    taken at this rate, 1/s, whatever the files say.
 
     Raises:
         CaptureError: a file of time stamps is missing, cannot be read, or does not fit its clip.
     """
     files = {path.stem: path for path in sorted(folder.glob("timestamps/*.csv"))}
     if not files:
-        return tuple(_of_container(clip) for clip in clips)
+        return tuple(_of_container(clip, regular) for clip in clips)
     found = []
     for camera, key, clip in zip(calibration.rig, calibration.keys, clips, strict=True):
         stem = match_camera(camera.name, key, files)
@@ -79,8 +88,8 @@ def read_stamps(folder: Path, calibration: Calibration, clips: Sequence[Clip]) -
     return tuple(found)
 
 
-def _of_container(clip: Clip) -> Stamps | None:
-    times = clip.times_s
+def _of_container(clip: Clip, regular: float | None) -> Stamps | None:
+    times = clip.times_s if regular is None else np.arange(clip.frame_count) / regular
     return Stamps(clip.path, times, common=False) if times is not None and len(times) > 1 else None
 
 
@@ -130,6 +139,7 @@ def check_clock(
                 f"{other.path}: {other.fps:.5g} frames/s, and {first.path.name} {first.fps:.5g} frames/s: image "
                 f"{count - 1} is taken {abs(apart[-1]) / first.fps:.3g} s {'later' if apart[-1] > 0 else 'earlier'}; "
                 "record all cameras at one rate",
+                resample=True,
             )
         if np.abs(apart).max() >= _DRIFT_FRAMES:
             warn(
@@ -141,7 +151,9 @@ def check_clock(
         drift = (len(first.seconds) - 1) * abs(measured / fps - 1)
         if abs(fps / measured - 1) > _ROUNDED and drift >= _DRIFT_FRAMES:
             raise _contradiction(
-                f"{where}: fps = {fps:g}, but {first.path} has {measured:.5g} frames/s; remove fps, or correct it",
+                f"{where}: fps = {fps:g}, but {first.path} has {measured:.5g} frames/s; remove fps, or correct it; if "
+                f'the videos play in slow motion what was recorded at {fps:g} frames/s, add times = "fps"',
+                resample=fps < measured,
             )
     for each in known:
         if each.irregularity >= _DRIFT_FRAMES:
@@ -152,8 +164,8 @@ def check_clock(
     return fps or measured
 
 
-def _contradiction(message: str) -> ClockError:
-    return ClockError(message, hint="or choose frames by their time stamps with --resample")
+def _contradiction(message: str, resample: bool) -> ClockError:
+    return ClockError(message, hint="or choose frames by their time stamps with --resample" if resample else "")
 
 
 def _nominal(fps: float, count: int) -> float:
@@ -176,7 +188,8 @@ def resample(
     The rate is ``fps``, else that of the slowest camera. A frame without an image within half an interval is blank.
 
     Raises:
-        CaptureError: the times of a clip are unknown, or the cameras have no time in common.
+        CaptureError: the times of a clip are unknown, the cameras have no time in common, or ``fps`` is above the rate
+            of each.
     """
     known: list[Stamps] = []
     for clip, each in zip(clips, stamps, strict=True):
@@ -185,6 +198,13 @@ def resample(
                 f"{clip.path}: nothing gives the times of its images, so they cannot be resampled; add timestamps/"
             )
         known.append(each)
+    fastest = max(known, key=lambda each: each.own_rate)
+    if fps is not None and fps > (1 + _ROUNDED) * fastest.own_rate:
+        raise ClockError(
+            f"{fastest.path}: no camera has more than {fastest.own_rate:.5g} frames/s, so there is nothing to resample "
+            f"to fps = {fps:g} of capture.toml; remove fps, or correct it; if the videos play in slow motion what was "
+            f'recorded at {fps:g} frames/s, add times = "fps" and do not resample'
+        )
     fps = fps or min(_nominal(each.fps, len(each.seconds)) for each in known)
     begin = max(float(each.since_start[0]) for each in known)
     pictures = [_nearest(each, begin, fps) for each in known]

@@ -1,8 +1,13 @@
-"""Clips that are video files, decoded by OpenCV, or by PyAV where an image is reduced before it becomes BGR."""
+"""Clips that are video files.
+
+OpenCV decodes them. PyAV decodes images that are reduced before they become BGR, and those that OpenCV gets wrong:
+interlaced ones, files whose packets are not all images, and files of which the first images differ.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,69 +17,131 @@ from numpy.typing import NDArray
 
 from tk.errors import VideoError
 from tk.io.captures.clip import Clip, Image, Reader, check_size, deliver
+from tk.io.captures.packets import REORDERED, Contents, as_bgr, decoded, open_video, read_contents
 from tk.io.paths import c_name
 
-VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv")
+VIDEO_SUFFIXES = (
+    *(".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv", ".3gp"),
+    *(".3g2", ".asf", ".dv", ".flv", ".mxf", ".ogv", ".vob"),
+)
 
+_PLANAR = ("yuv420p", "yuvj420p")  # see VideoClip.planar
 _FULL_RANGE = 2  # FFmpeg's AVCOL_RANGE_JPEG
-_REORDERED = 16  # most images that precede another one in the file but follow it in the video, H.264
+#: the first images of OpenCV and PyAV are compared at every so many pixels; the mean difference of right ones, which
+#: convert colours differently, is 1 at most, that of a black or a turned one 40
+_EVERY, _MOST_DIFFERENCE = 4, 8.0
 
 
 @dataclass(frozen=True)
 class VideoClip(Clip):
-    """A video file; made by :func:`probe_video`."""
+    """A video file; made by :func:`probe_video`.
 
-    turned: bool = False  # whether the file asks for its coded images to be turned
+    Attributes:
+        turn: degrees, counter-clockwise, by which the file asks players to turn its images: 0, 90, 180 or 270.
+        interlaced: whether images are marked as interlaced.
+        undecodable: number of coded images before the first one that can be decoded.
+        by_opencv: whether OpenCV decodes it; else PyAV.
+        as_coded: whether the images are not turned.
+        planar: whether the images consist of a plane of brightness and two planes of colours at half the size, 8 bits.
+    """
+
+    turn: int = 0
+    interlaced: bool = False
+    undecodable: int = 0
+    by_opencv: bool = True
+    as_coded: bool = False
+    planar: bool = False
 
     def open(self) -> Reader:
-        return _open_planes(self) or _VideoReader(self)
+        return _OpenCVReader(self) if self.by_opencv and not self.by_planes else _PyAVReader(self)
+
+    def unturned(self) -> VideoClip:
+        """Return the same images as they are coded."""
+        size = (self.height, self.width) if self.turn % 180 else (self.width, self.height)
+        return replace(self, width=size[0], height=size[1], as_coded=True, by_opencv=False)
+
+    @property
+    def by_planes(self) -> bool:
+        """Whether the planes are reduced before they become BGR; rare videos and masks are reduced afterwards."""
+        if not self.recorded_size or self.is_mask or not self.planar or (self.turn and not self.as_coded):
+            return False
+        factor = self.recorded_size[0] // self.width
+        divided = (factor * self.width, factor * self.height) == self.recorded_size
+        return divided and self.width % 2 == self.height % 2 == 0
 
 
 def probe_video(path: Path, is_mask: bool = False) -> VideoClip:
-    """Open a video file and decode its first image.
+    """Open a video file, and compare the first images that OpenCV and PyAV decode.
 
-    Frames are counted, and their times read, from the coded packets without decoding (about 10 µs a frame): the header
-    of an `.mkv` is only an estimate, and the header of a truncated file counts all frames.
+    Frames are counted, and their times read, from the coded packets (about 10 µs a frame): the header of an `.mkv` is
+    only an estimate, and the header of a truncated file counts all frames.
 
     Raises:
-        VideoError: no video, empty, cut off, or of a codec that OpenCV cannot decode.
+        VideoError: no video, empty, cut off, or of a codec that cannot be decoded.
     """
-    capture = _open_video(path)
-    try:
-        promised = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        turned = capture.get(cv2.CAP_PROP_ORIENTATION_META) != 0
-        ok, picture = capture.read()
-    finally:
-        capture.release()
-    if not ok:
-        raise VideoError(f"{path}: no picture in it can be decoded; re-encode it, e.g. as H.264")
-    times_s = _packet_times(path)
-    frame_count = len(times_s)
-    # one percent: headers that give a duration only are rounded
-    if frame_count < promised - max(1, promised // 100):
-        raise VideoError(
-            f"{path}: is cut off: {frame_count} of its {promised} frames are there; copy it again, or re-encode it"
+    found = read_contents(path)
+    return VideoClip(
+        path,
+        found.width,
+        found.height,
+        found.frame_count,
+        is_mask,
+        found.times_s,
+        turn=found.turn,
+        interlaced=found.interlaced,
+        undecodable=found.undecodable,
+        by_opencv=not (found.interlaced or found.cut) and _opencv_agrees(path, found),
+        planar=found.pixels in _PLANAR,
+    )
+
+
+def as_calibrated(clip: Clip, size: tuple[int, int]) -> Clip:
+    """Return a clip without the turn that its file asks for, if only then it has the size of the calibration."""
+    if isinstance(clip, VideoClip) and clip.turn % 180 and (clip.height, clip.width) == size != size[::-1]:
+        return clip.unturned()
+    return clip
+
+
+def notes_on(clips: Sequence[Clip]) -> list[str]:
+    """Return lines about videos that the user should know of: interlaced ones, and ones that are not turned."""
+    lines = []
+    videos = [clip for clip in clips if isinstance(clip, VideoClip)]
+    if marked := [clip for clip in videos if clip.interlaced]:
+        lines.append(
+            f"{marked[0].path}{f' and {len(marked) - 1} more' if marked[1:] else ''}: marked as interlaced; if moving "
+            "edges look like combs, deinterlace the videos: ffmpeg -i IN -vf bwdif=mode=send_frame OUT"
         )
-    height, width = picture.shape[:2]
-    increasing = bool((np.diff(times_s) > 0).all())
-    times = times_s if increasing else None
-    return VideoClip(path, width, height, frame_count, is_mask, times, turned=turned)
+    lines += [
+        f"{clip.path}: asks for a turn by {clip.turn}°, but the calibration is of images that are not turned: it is "
+        "read without the turn"
+        for clip in videos
+        if clip.as_coded
+    ]
+    return lines
 
 
-def damaged_images(path: Path, stop: int) -> list[int]:
+def odd_turn(clip: Clip, clips: Sequence[Clip]) -> str:
+    """Return in words by how much the file of a clip asks for a turn, if most of the other clips ask for another."""
+    turns = [each.turn for each in clips if isinstance(each, VideoClip)]
+    if not isinstance(clip, VideoClip) or 2 * turns.count(clip.turn) >= len(turns):
+        return ""
+    asks = f"asks players to turn its images by {clip.turn}°" if clip.turn else "asks for no turn of its images"
+    return f"its file {asks}, unlike most of the others: the calibration may be of images without this turn"
+
+
+def damaged_images(clip: VideoClip, stop: int) -> list[int]:
     """Return the images of a video before ``stop`` that FFmpeg cannot decode unless it repairs them, which it does
     without an error, so that no reader notices."""
-    import av  # slow to import, and only needed for a message
     import av.error
 
     times: list[int] = []
     damaged: set[int] = set()
-    with av.open(c_name(path, VideoError)) as container:
-        stream = container.streams.video[0]
+    container, stream = open_video(clip.path)
+    with container:
         stream.thread_type = "SLICE"  # threads of whole images report errors with later ones
         stream.codec_context.options = {"err_detect": "explode"}
         packets = container.demux(stream)
-        while len(times) < stop + _REORDERED:
+        while len(times) < clip.undecodable + stop + REORDERED:
             try:
                 packet = next(packets)
             except (StopIteration, av.error.FFmpegError):  # in an error a reader fails, too
@@ -82,19 +149,21 @@ def damaged_images(path: Path, stop: int) -> list[int]:
             time = packet.dts if packet.pts is None else packet.pts  # AVI has no other times
             if time is None:  # the last packet has no image
                 continue
-            times.append(time)
+            if not packet.is_discard:
+                times.append(time)
             try:
                 packet.decode()
             except av.error.FFmpegError:
                 damaged.add(time)
-    return [i for i, time in enumerate(sorted(times)[:stop]) if time in damaged]
+    shown = sorted(times)[clip.undecodable :][:stop]
+    return [i for i, time in enumerate(shown) if time in damaged]
 
 
-class _VideoReader:
+class _OpenCVReader:
     def __init__(self, clip: VideoClip) -> None:
         self._clip = clip
         self._index = 0
-        self._capture = _open_video(clip.path)
+        self._capture = _open_opencv(clip.path)
         self._whole: NDArray[Any] | None = None  # memory of the last recorded image
 
     def skip(self) -> None:
@@ -122,43 +191,24 @@ class _VideoReader:
         raise _undecodable(self._clip, self._index)
 
 
-def _open_planes(clip: VideoClip) -> _PlaneReader | None:
-    """Return a reader of the planes of a reduced video, None for a video that is left to OpenCV.
-
-    These are: full size, masks, turned images, and, because they are rare, colours at full size, more than 8 bits, and
-    sizes that the reduction divides with a remainder.
-    """
-    if not clip.recorded_size or clip.is_mask or clip.turned:
-        return None
-    import av  # slow to import, and small videos do without
-
-    container = av.open(c_name(clip.path, VideoError))
-    context = container.streams.video[0].codec_context
-    context.thread_count = 1  # as in _open_video
-    factor = clip.recorded_size[0] // clip.width
-    divided = (factor * clip.width, factor * clip.height) == clip.recorded_size
-    if divided and clip.width % 2 == clip.height % 2 == 0 and context.pix_fmt in ("yuv420p", "yuvj420p"):
-        return _PlaneReader(clip, container)
-    container.close()
-    return None
-
-
-class _PlaneReader:
-    """Reads a reduced video. The planes of brightness and colour are reduced before they become BGR.
+class _PyAVReader:
+    """Reads what OpenCV does not. Of a reduced video the planes of brightness and colour are reduced before they become
+    BGR.
 
     Measured on 1920×1080, read at half the size: 3.8 ms an image, of which decoding is 3.3. OpenCV at full size and a
     reduction after it take 5.2 ms.
     """
 
-    def __init__(self, clip: VideoClip, container: Any) -> None:
+    def __init__(self, clip: VideoClip) -> None:
         self._clip = clip
         self._index = 0
-        self._container = container
-        self._images = container.decode(video=0)
-        # brightness, and below it the two colours, as COLOR_YUV2BGR_I420 expects them
-        self._planes = np.empty((clip.height * 3 // 2, clip.width), np.uint8)
-        colors = self._planes[clip.height :].reshape(2, clip.height // 2, clip.width // 2)
-        self._small = (self._planes[: clip.height], *colors)
+        self._container, stream = open_video(clip.path)
+        self._images = decoded(self._container.demux(stream))
+        if clip.by_planes:
+            # brightness, and below it the two colours, as COLOR_YUV2BGR_I420 expects them
+            self._planes = np.empty((clip.height * 3 // 2, clip.width), np.uint8)
+            colors = self._planes[clip.height :].reshape(2, clip.height // 2, clip.width // 2)
+            self._small = (self._planes[: clip.height], *colors)
 
     def _next(self) -> Any:
         import av.error
@@ -174,8 +224,14 @@ class _PlaneReader:
         self._next()
 
     def read(self, out: Image) -> None:
-        image = self._next()
-        check_size(self._clip, image.width, image.height, self._clip.path)
+        clip, image = self._clip, self._next()
+        if clip.by_planes and image.format.name in _PLANAR:
+            check_size(clip, image.width, image.height, clip.path)
+            self._reduce(image, out)
+        else:
+            deliver(clip, as_bgr(image, 0 if clip.as_coded else clip.turn // 90), clip.path, out)
+
+    def _reduce(self, image: Any, out: Image) -> None:
         full_range = image.color_range == _FULL_RANGE or image.format.name == "yuvj420p"
         for k, (plane, small) in enumerate(zip(image.planes, self._small, strict=True)):
             whole = np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)[:, : plane.width]
@@ -197,50 +253,31 @@ def _undecodable(clip: VideoClip, index: int) -> VideoError:
     )
 
 
-def _open_video(path: Path) -> cv2.VideoCapture:
-    if path.exists() and not path.is_file():  # OpenCV would wait for a pipe
-        raise VideoError(f"{path}: is not a file")
+def _open_opencv(path: Path) -> cv2.VideoCapture:
     # one decoding thread: the cameras are decoded in parallel already (measured: 5 % faster on 2 cores, less memory)
     capture = cv2.VideoCapture(c_name(path, VideoError), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
     if not capture.isOpened():
-        raise VideoError(f"{path}: {_why_unreadable(path)}")
+        raise VideoError(f"{path}: cannot be opened by OpenCV")
     return capture
 
 
-def _why_unreadable(path: Path) -> str:
+def _opencv_agrees(path: Path, contents: Contents) -> bool:
+    """Return whether OpenCV decodes the last of the first images of a file as PyAV does, and not an older one."""
+    found = []
     try:
-        with path.open("rb") as file:
-            head = file.read(12)
-    except OSError as reason:
-        return f"cannot be read ({reason.strerror or reason})"
-    if not head:
-        return "is an empty file; copy it again"
-    if _has_sound_only(path):
-        return "holds sound, but no video; put the camera's video in its place"
-    if head[4:8] in (b"ftyp", b"mdat", b"wide", b"free"):
-        return "is cut off: the index at its end is missing; copy it again, or finish the recording"
-    return "is not a video that can be decoded; put a video file in its place"
-
-
-def _has_sound_only(path: Path) -> bool:
-    """Return whether a file has streams, but none of images."""
-    import av  # slow to import, and only needed for this message
-
-    try:
-        with av.open(str(path)) as container:
-            return len(container.streams) > 0 and not container.streams.video
-    except (OSError, ValueError):  # base classes of PyAV's errors
+        capture = _open_opencv(path)
+    except VideoError:
         return False
-
-
-def _packet_times(path: Path) -> NDArray[np.float64]:
-    """Return the times (N,) of the coded images in a video file, seconds, ascending."""
-    raw = -1  # CAP_PROP_FORMAT's way to ask for packets
-    capture = cv2.VideoCapture(c_name(path, VideoError), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, raw])
-    times: list[float] = []
     try:
-        while capture.grab():
-            times.append(capture.get(cv2.CAP_PROP_POS_MSEC))
+        for _ in contents.first:
+            ok, image = capture.read()
+            if not ok or image.shape[:2] != (contents.height, contents.width):
+                return False
+            found.append(np.ascontiguousarray(image[::_EVERY, ::_EVERY]))
     finally:
         capture.release()
-    return 1e-3 * np.sort(times)  # some codecs store images in another order
+    right = np.ascontiguousarray(as_bgr(contents.first[-1], contents.turn // 90)[::_EVERY, ::_EVERY])
+    if cv2.absdiff(right, found[-1]).mean() > _MOST_DIFFERENCE:
+        return False
+    planes = [bytes(image.planes[0]) for image in contents.first]
+    return planes[0] == planes[-1] or not np.array_equal(found[0], found[-1])

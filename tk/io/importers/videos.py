@@ -12,9 +12,6 @@ from tk.io.captures.calibration import match_camera
 from tk.io.captures.pictures import PICTURE_SUFFIXES
 from tk.io.captures.video import VIDEO_SUFFIXES
 
-#: suffixes of videos that tk does not read; a message names such files if there are no others
-_OTHER_VIDEOS = (".m4v", ".mts", ".m2ts", ".webm", ".wmv", ".mpg", ".mpeg", ".flv", ".3gp", ".ts")
-
 #: words in names of cameras and files that do not identify a camera
 _COMMON_WORDS = frozenset({"int", "ext", "img", "calib", "video", "synchronized", "sync", "camera", "cam", "port"})
 
@@ -246,13 +243,12 @@ def _one_recording(
                 hint="with --trial NAME",
             )
         searched.append("the folder itself" if pattern == "." else pattern)
-    others = sorted(path.name for path in _regular(root) if path.suffix.lower() in _OTHER_VIDEOS)
     of_trial = f" of the trial {trial!r}" if trial else ""
-    if others:
-        raise VideoError(
-            f"{root}: {_some(others)}: tk reads {', '.join(VIDEO_SUFFIXES)}; convert them, e.g. with ffmpeg"
-        )
-    raise VideoError(f"{root}: holds no videos{of_trial} of two cameras; searched in {', '.join(searched)}")
+    there = _some(path.name for path in _listed(root)) or "nothing"
+    raise VideoError(
+        f"{root}: holds no videos{of_trial} of two cameras; searched in {', '.join(searched)}; the folder holds "
+        f"{there}; tk reads {', '.join(VIDEO_SUFFIXES)}"
+    )
 
 
 def _regular(folder: Path) -> list[Path]:

@@ -18,12 +18,13 @@ from tk.io.captures.calibration import camera_table
 from tk.io.captures.capture import open_capture
 from tk.io.captures.clip_folder import probe
 from tk.io.captures.pictures import PICTURE_SUFFIXES
+from tk.io.captures.video import as_calibrated
 from tk.io.importers.project import Project
 from tk.io.paths import replacing, text_of
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import closest_to_axes, common_boxes
 from tk.model.cameras.mounting import FoundUp, infer_up
-from tk.model.cameras.up import up_text
+from tk.model.cameras.up import shown_up, up_text
 from tk.model.cameras.volume import Volume
 
 #: least side of a working volume, metres: a person with arms spread needs more
@@ -55,7 +56,7 @@ def write_capture(project: Project, output: Path) -> Imported:
     rig = _fitted(_renamed(project.rig, notes), project.clips, notes)
     found = FoundUp(project.up, f"as {project.tool} defines it") if project.up else infer_up(rig)
     volume, where = find_volume(rig)
-    notes.append(f"up = {_up_toml(found.up)}: {found.how}")
+    notes.append(f"up = {shown_up(found.up)}: {found.how}")
     if volume is None:
         notes.append(where)
     else:
@@ -169,7 +170,7 @@ def _renamed(rig: Rig, notes: list[str]) -> Rig:
 def _fitted(rig: Rig, clips: Sequence[Path], notes: list[str]) -> Rig:
     cameras = []
     for camera, clip in zip(rig, clips, strict=True):
-        found = probe(clip)
+        found = as_calibrated(probe(clip), (camera.width, camera.height))
         fitted, note = fit_size(camera, found.width, found.height, clip)
         if note:
             notes.append(note)

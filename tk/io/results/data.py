@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +15,10 @@ from tk.io.results.schema import ROWS as DATASETS
 from tk.io.results.schema import columns_of
 from tk.io.results.status import Status, has_pose
 from tk.io.toml import parse_toml
+from tk.model.body.angles import ANGLES, UNMEASURED
 from tk.model.body.anthropometry import AVERAGE_BODY
-from tk.model.body.joints import JOINTS, ROWS, in_joint_order
+from tk.model.body.expected_error import expected_errors, in_cm, mean_range
+from tk.model.body.joints import JOINTS, in_joint_order
 from tk.model.body.skeleton import paper_poses, skeleton_of_names
 from tk.model.cameras.camera import Rig
 
@@ -37,6 +39,20 @@ class JointAngles:
     joint: str  # name of the dataset, such as `knee_l`
     names: tuple[str, ...]  # names of the angles, such as `flexion`
     convention: str  # zero position and positive direction, in words
+    unmeasured: str = ""  # angles that are NaN in every frame, with the reason
+
+    @classmethod
+    def of_body(cls, pose_names: Sequence[str]) -> tuple[JointAngles, ...]:
+        """Return all joints, of a body with these degrees of freedom."""
+        return tuple(
+            cls(
+                angles.joint,
+                angles.names,
+                angles.convention,
+                f"{', '.join(missing)}: {UNMEASURED}" if (missing := angles.unmeasured(pose_names)) else "",
+            )
+            for angles in ANGLES
+        )
 
     def __post_init__(self) -> None:
         if not self.joint or "/" in self.joint or not self.names:
@@ -208,13 +224,12 @@ class Result:
             f"{int((self.status == s).sum())} {s.name.lower()}" for s in Status if (self.status == s).any()
         )
         first = f"{self.frames[0]} to {self.frames[-1]}, " if len(self) else ""
-        known = np.empty(0) if (expected := self.expected_error) is None else expected[self.has_pose]
-        sure = np.isfinite(known).any()
-        sigma = f"expected error of a joint {100 * np.nanmedian(known):.1f} cm" if sure else "no sigma"
+        expected = self.mean_error_range
+        error = "no sigma" if expected is None else f"expected error {in_cm(expected)}"
         return (
             f"Result {self.path.name}: capture {self.meta.capture}, method {self.meta.method}\n"
             f"{len(self)} frames, {first}{self.meta.fps:g} frames/s, {self.joints.shape[1]} joints\n"
-            f"{counts or 'no status'}; {sigma}"
+            f"{counts or 'no status'}; {error}"
         )
 
     @property
@@ -228,17 +243,29 @@ class Result:
         return None if self.residual is None else np.asarray(self.residual.sum(axis=2))
 
     @property
-    def expected_error(self) -> Float | None:
-        """Return the expected distance (root mean square) of each joint from its true position (F, J), metres; None
-        without sigma.
-
-        The root of three variances along the axes and the squared constant offset of the joint's kind
-        (:class:`tk.model.body.joints.Joint`): sigma alone does not contain the offset.
-        """
-        if self.sigma is None:
+    def excluded(self) -> NDArray[np.bool_] | None:
+        """Return (F, C) True for a camera that was left out of a frame with a pose; None if the result has no
+        residual."""
+        if self.residual is None:
             return None
-        offsets = np.array([ROWS[name].offset_m if name in ROWS else np.nan for name in self.meta.joint_names])
-        return np.asarray(np.sqrt(3 * self.sigma**2 + offsets**2))
+        used = np.isfinite(self.residual[..., 0])
+        return np.asarray(~used & (self.has_pose & used.any(axis=1))[:, None])
+
+    @property
+    def expected_error(self) -> Float | None:
+        """Return the expected distance (F, J) of each joint from its true position, metres; None without sigma.
+
+        It contains the joint's constant offset, see :mod:`tk.model.body.expected_error`.
+        """
+        return None if self.sigma is None else expected_errors(self.sigma, self.meta.joint_names)
+
+    @property
+    def mean_error_range(self) -> Float | None:
+        """Return the range (2,) of the raw joints' mean error in the frames with a pose, metres; None without sigma.
+
+        It holds with a probability of 90 % for a further person.
+        """
+        return None if (expected := self.expected_error) is None else mean_range(expected[self.has_pose])
 
     @property
     def has_pose(self) -> NDArray[np.bool_]:

@@ -228,7 +228,9 @@ class StoredPerson:
                 found.setdefault(entry.optional, exists)
         try:
             found["angles"] = tuple(
-                JointAngles(joint, file.names(path, "names"), file.text(path, "convention"))
+                JointAngles(
+                    joint, file.names(path, "names"), file.text(path, "convention"), file.text(path, "unmeasured", "")
+                )
                 for joint, path in ((joint, f"{prefix}angles/{joint}") for joint in angles)
             )
             return ResultMeta(**found)

@@ -96,8 +96,11 @@ ROWS = (
         {"names": "segment_names"}, field="segments_rotation", optional="segment_names", smoothed=True,
     ),
     Dataset(
-        "angles/<joint>", "F k", "float64", "degrees; the group's attribute `joints` gives the order",
-        {"names": "names", "convention": "convention"}, field="angles", each="angles", smoothed=True,
+        "angles/<joint>", "F k", "float64",
+        "degrees; the group's attribute `joints` gives the order; `unmeasured` gives the angles that are NaN in every "
+        "frame and the reason",
+        {"names": "names", "convention": "convention", "unmeasured": "unmeasured"},
+        field="angles", each="angles", smoothed=True,
     ),
     Dataset(
         "feet/position", "F 4 3", "float64", ", ".join(FOOT_POINTS),

@@ -36,8 +36,9 @@ def to_pandas(result: Result) -> pandas.DataFrame:
     """Return a table with one row per frame, indexed by frame number.
 
     Columns: ``time`` (seconds), ``status`` (a word), ``objective``; ``<joint>_x``, ``_y``, ``_z`` and ``<joint>_sigma``
-    (metres); ``_x``, ``_y``, ``_z`` of the points of the feet; the pose by its names (radians and metres);
-    ``<joint>_<angle>_deg``; ``<camera>_missing`` and ``<camera>_surplus``, the residual.
+    (metres); ``_x``, ``_y``, ``_z`` of the points of the feet; ``<joint>_<angle>_deg``; ``<camera>_missing`` and
+    ``<camera>_surplus``, the residual. A result without joint angles has its pose instead, ``<name>_rad`` and
+    ``<name>_m``.
 
     Raises:
         ExportError: pandas is not installed.
@@ -49,8 +50,11 @@ def to_pandas(result: Result) -> pandas.DataFrame:
         "objective": result.objective,
     }
     suffix = {"sigma": "_sigma", "angles": "_deg"}
+    omitted = {"segments_rotation"} | ({"pose"} if result.angles else set())
     for name, values, labels in _variables(result):
-        if name != "segments_rotation":
+        if name == "pose":
+            labels = [[f"{dof}_{unit}" for dof, unit in zip(*labels, result.meta.pose_units, strict=True)]]
+        if name not in omitted:
             headers = ["_".join(parts).replace(" ", "_") + suffix.get(name, "") for parts in product(*labels)]
             columns |= dict(zip(headers, values.reshape(len(result), len(headers)).T, strict=True))
     return pd.DataFrame(columns, index=pd.Index(result.frames, name="frame"))

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.body.joints import ARM, CROOK
+from tk.model.body.joints import ARM, CROOK, ROWS, TABLE, WAIST
 from tk.model.body.rotations import decompose
 from tk.model.body.skeleton import SEGMENTS, Skeleton
 
@@ -53,6 +53,23 @@ class AngleSet:
     def names(self) -> tuple[str, ...]:
         """Return the names of the angles, in the order of the columns."""
         return tuple(name for name, _, _ in self.columns)
+
+    def unmeasured(self, pose_names: Sequence[str]) -> tuple[str, ...]:
+        """Return the angles about whose axis a body with these degrees of freedom does not turn at the joint.
+
+        Such an angle is the same in all poses, which is no measurement.
+        """
+        row = ROWS.get(WAIST if self.joint == "lumbar" else self.joint)
+        if self.parent is None or row is None:
+            return ()
+        axes = [_ISB.T @ dof.axis for dof, name in zip(row.dofs, row.dof_names, strict=True) if name in pose_names]
+        if len(axes) >= len(self.names):  # the arms' axes are oblique
+            return ()
+        return tuple(
+            name
+            for name, k, _ in self.columns
+            if not any(abs(axis["xyz".index(self.sequence[k])]) > 0.5 for axis in axes)
+        )
 
     @property
     def mirrored(self) -> bool:
@@ -122,13 +139,17 @@ def _sets() -> tuple[AngleSet, ...]:
                 "zxy",
                 (("dorsiflexion", 0, 1.0), ("inversion", 1, 1.0)),
                 "foot against shin, turns Z-X-Y (Wu et al. 2002): 0 is a right angle, dorsiflexion and inversion are "
-                "positive; all 0 where the skeleton's feet ride on the shins",
+                "positive",
             ),
         ]
     return tuple(found)
 
 
 ANGLES: tuple[AngleSet, ...] = _sets()
+#: all degrees of freedom of the body
+DOF_NAMES = tuple(name for row in TABLE for name in row.dof_names)
+#: why an angle is NaN in every frame
+UNMEASURED = "the body has no degree of freedom for it"
 
 
 def standing_rotations(skeleton: Skeleton, transforms: Float) -> Float:
@@ -146,23 +167,31 @@ def standing_axes() -> Float:
     return np.array([arms[name[-2:]] if "arm" in name else np.eye(3) for name in SEGMENTS])
 
 
-def joint_angles(rotations: Float, T_world_body: Float, segments: Sequence[str] = SEGMENTS) -> dict[str, Float]:
-    """Return the angles by joint, degrees, each (..., k) with the columns of :data:`ANGLES`.
+def joint_angles(
+    rotations: Float,
+    T_world_body: Float,
+    segments: Sequence[str] = SEGMENTS,
+    pose_names: Sequence[str] = DOF_NAMES,
+) -> dict[str, Float]:
+    """Return the angles by joint, degrees, each (..., k) with the columns of :data:`ANGLES`; NaN if unmeasured.
 
     Args:
         rotations: (..., S, 3, 3) from :func:`standing_rotations`.
         T_world_body: (3, 3) the world's forward, left and up axes as columns; see :class:`Skeleton`.
         segments: names of the S segments.
+        pose_names: names of the degrees of freedom that the body has.
     """
     result = {}
     for angles in ANGLES:
         if angles.child not in segments:  # a foot that is fixed to the calf
-            result[angles.joint] = np.zeros((*rotations.shape[:-3], len(angles.columns)))
+            result[angles.joint] = np.full((*rotations.shape[:-3], len(angles.columns)), np.nan)
             continue
         parent = T_world_body if angles.parent is None else rotations[..., segments.index(angles.parent), :, :]
         child = rotations[..., segments.index(angles.child), :, :]
         turns = decompose(angles.sequence, _in_isb(np.swapaxes(parent, -1, -2) @ child, angles.mirrored))
-        result[angles.joint] = np.degrees(np.stack([sign * turns[..., k] for _, k, sign in angles.columns], axis=-1))
+        degrees = np.degrees(np.stack([sign * turns[..., k] for _, k, sign in angles.columns], axis=-1))
+        degrees[..., np.isin(angles.names, angles.unmeasured(pose_names))] = np.nan
+        result[angles.joint] = degrees
     return result
 
 

@@ -58,7 +58,7 @@ class Joint:
     carrier: str = ""  # the segment that carries the joint centre in `/joints/position`; empty: not an output
     bone_from: str = ""  # the joint at the other end of the bone in drawings; empty at the root
     added_dofs: bool = False  # whether its degrees of freedom are beyond the paper's 24
-    offset_m: float = np.nan  # constant offset of the output joint from a ground truth's, root mean square, metres
+    offset_m: float = np.nan  # constant offset of the output joint from a ground truth's, mean length, metres
     # True for an output joint beyond the 15 that every result and ground truth has; readers return NaN for a file
     # without it
     added: bool = False
@@ -117,8 +117,8 @@ def _neck(d: BodyDimensions) -> Float:
 # Standard deviations of waist and ankles about zero, degrees. Chosen on the development captures; half and twice the
 # value change the mean errors of walk (32 frames) by 0.01 cm.
 _WAIST_DEG, _ANKLE_DEG = 12.0, 20.0
-# `offset_m`: the median offset in the trunk's frame, which `tk evaluate` removes, root mean square over walk, dance,
-# fold, cube, treadmill-slow, rig9 and sixteen, both sides.
+# `offset_m`: length of the median offset in the trunk's frame, which `tk evaluate` removes, mean over both sides and
+# the recordings that docs/evaluation.md lists (`python -m scripts.joint_offsets`).
 _MIDDLE = (
     Joint("torso", lambda d: np.zeros(3), turns="torso", dofs=(
         Dof("x", _X, prismatic=True), Dof("y", _Y, prismatic=True), Dof("z", _Z, prismatic=True),
@@ -132,25 +132,25 @@ _MIDDLE = (
     Joint("pelvis", lambda d: np.zeros(3), above="waist", carrier="pelvis", offset_m=0.017),
     Joint("neck", _neck, above="torso", turns="head", chain="head", carrier="torso", bone_from="pelvis", dofs=(
         Dof("pitch", _Y, -70.0, 65.0), Dof("yaw", _X, -50.0, 50.0),
-    ), offset_m=0.016),
+    ), offset_m=0.017),
     Joint("head_top", lambda d: _neck(d) + d.head * _Z, above="neck", chain="head", carrier="head", bone_from="neck",
-          offset_m=0.024),
+          offset_m=0.020),
 )  # fmt: skip
 _ARM_ROWS = (
     Joint("shoulder", _shoulder, above="torso", turns="upper_arm", chain="arm", carrier="upper_arm", bone_from="neck",
           dofs=(Dof("yaw", ARM_POLE, -180.0, 180.0), Dof("pitch", _ARM_RISE, -80.0, 80.0),
                 Dof("roll", ARM, -110.0, 110.0)), offset_m=0.011),
     Joint("elbow", _elbow, above="shoulder", turns="forearm", chain="arm", carrier="upper_arm", bone_from="shoulder",
-          dofs=(Dof("flexion", ELBOW_AXIS, -5.0, 155.0),), offset_m=0.012),
+          dofs=(Dof("flexion", ELBOW_AXIS, -5.0, 155.0),), offset_m=0.016),
     Joint("wrist", lambda d: _elbow(d) + d.forearm * ARM, above="elbow", chain="arm", carrier="forearm",
           bone_from="elbow", offset_m=0.013),
 )  # fmt: skip
 _LEG_ROWS = (
     Joint("hip", _hip, above="waist", turns="thigh", chain="leg", carrier="pelvis", bone_from="pelvis",
           dofs=(Dof("pitch", _Y, -150.0, 40.0), Dof("yaw", _X, -45.0, 80.0), Dof("roll", -_Z, -70.0, 70.0)),
-          offset_m=0.020),
+          offset_m=0.019),
     Joint("knee", _knee, above="hip", turns="calf", chain="leg", carrier="thigh", bone_from="hip",
-          dofs=(Dof("flexion", _Y, -10.0, 160.0),), offset_m=0.023),
+          dofs=(Dof("flexion", _Y, -10.0, 160.0),), offset_m=0.013),
     Joint("ankle", _ankle, above="knee", turns="foot", chain="leg", carrier="calf", bone_from="knee",
           dofs=(Dof("flexion", -_Y, -60.0, 40.0, straight_deg=_ANKLE_DEG),
                 Dof("inversion", -_X, -30.0, 40.0, straight_deg=_ANKLE_DEG)), added_dofs=True, offset_m=0.011),

@@ -65,6 +65,12 @@ def turn(axis: str, angle: Float) -> Float:
     return R
 
 
+def half_turn(axis: Float) -> Float:
+    """Return the rotation (..., 3, 3) by 180° about an axis (..., 3) of any length."""
+    axis = axis / np.linalg.norm(axis, axis=-1, keepdims=True)
+    return np.asarray(2 * axis[..., :, None] * axis[..., None, :] - np.eye(3))
+
+
 def compose(sequence: str, angles: Float) -> Float:
     """Return rotations (..., 3, 3) of angles (..., 3), radians, about moving axes: "zxy" is Rz Rx Ry."""
     first, second, third = (turn(axis, angles[..., k]) for k, axis in enumerate(sequence))

@@ -59,6 +59,11 @@ def up_text(up: str | Sequence[float] | Float) -> str:
     return json.dumps([float(value) for value in vector])
 
 
+def shown_up(up: str) -> str:
+    """Return a direction as messages show it: the axis's name, or a vector with three decimals."""
+    return up if not up.startswith("[") else f"[{', '.join(f'{value:.3f}' for value in up_vector(up))}]"
+
+
 def _unit(values: ArrayLike) -> Float:
     try:
         vector = np.asarray(values, dtype=np.float64)
@@ -68,7 +73,7 @@ def _unit(values: ArrayLike) -> Float:
         raise ConfigError(f"up = {values!r} must be {UP_FORMS}")
     length = float(np.linalg.norm(vector))
     if length < _SHORT:
-        raise ConfigError(f"up = {vector.tolist()} has no direction: its length is {length:g}")
+        raise ConfigError(f"up = {np.round(vector, 3).tolist()} has no direction: its length is {length:g}")
     if abs(length - 1.0) < 1e-12:  # the text of a unit vector does not change
         return vector
     return vector / length

@@ -114,6 +114,14 @@ class Agreement:
         """(C,) cameras that were tested with another one, and are not wrong."""
         return np.isfinite(self.tangency.apart).any(axis=1) & ~np.isin(np.arange(len(self.names)), self.wrong)
 
+    @property
+    def pairs_px(self) -> Float:
+        """(C,) error of the pairs of each camera with the right ones, median, pixels of the recorded image; NaN if none
+        was tested. A camera is wrong if most of its pairs err, whatever the hull of the others shows."""
+        apart = [self.tangency.apart[c, [k for k in self.right if k != c]] for c in range(len(self.names))]
+        median = [float(np.median(known)) if len(known := pairs[np.isfinite(pairs)]) else np.nan for pairs in apart]
+        return np.asarray(np.array(self.reductions) * np.array(median) / self.tangency.pixel)
+
     def reason(self, camera: int) -> str:
         """Return what is wrong with a camera."""
         error = self.tangency.error[camera, self.right]
@@ -122,7 +130,7 @@ class Agreement:
             return "its masks miss a part of the person"
         off = np.hypot(*self.shift_px[camera])
         if not off > 0 and (error < -tolerance).any():
-            off = self.reductions[camera] * np.abs(error).max() / self.tangency.pixel[camera]
+            off = self.pairs_px[camera]
         if off > 0:
             return f"off by {off:.0f} px or more: turned, moved, late, or another camera's video"
         return "its masks show something else beside the person, or are wrong"
@@ -253,6 +261,13 @@ class MaskAgreement:
             f"{names}{without if wrong else ''} see the person from the same or from opposite sides, so the distance "
             f"along their line of sight is unknown by more than 5 cm: use a camera from another side, at 30 to 150°"
         )
+
+    def mean_outside(self, frames: Sequence[Masks], cameras: Sequence[int]) -> float:
+        """Return the mean share of the masks (C, H, W) of these cameras outside the hulls of the others of them; NaN if
+        there is no hull."""
+        hulls = self.hulls([self.possible(masks) for masks in frames])
+        views = [(self.small(masks), hull) for masks, hull in zip(frames, hulls, strict=True) if hull is not None]
+        return self._mean_outside(views, cameras)
 
     def hulls(self, seen: Sequence[Bool]) -> list[Hull | None]:
         """Return each frame's hulls from its small masks (C, h, w); None if no two cameras see the same voxel."""

@@ -47,5 +47,5 @@ def _derive(skeleton: Skeleton, dimensions: BodyDimensions, poses: Float) -> Der
         joints=joint_positions(skeleton, T),
         rotations=to_quaternions(R),
         feet=foot_points(skeleton, dimensions, T),
-        angles=joint_angles(R, skeleton.T_world_body),
+        angles=joint_angles(R, skeleton.T_world_body, pose_names=skeleton.names),
     )
