@@ -32,7 +32,6 @@ from tk.model.masks.image_shift import shift_between
 from tk.model.masks.mask_agreement import INCONSISTENT, Agreement, MaskAgreement
 from tk.model.masks.regions import clean_by_area
 from tk.model.masks.silhouettes import HOLE_SHARE
-from tk.run.delays import REACH
 from tk.run.segmentation import make_labeller
 from tk.run.task import Task
 from tk.settings import Settings
@@ -43,7 +42,9 @@ Masks = NDArray[np.uint8]
 # These values decide which findings are printed, and no tracking result depends on them. With half and twice each value
 # the findings on walk, fold, rig9, pair and treadmill-slow are the same, except for specks in the ragged masks of
 # treadmill-slow (half the value names two cameras more, twice the value one fewer).
-#: frames that are compared; frames whose neighbours, REACH before and after, are also compared
+#: largest shift of a video that is compared, frames; at the edge it is no optimum
+_REACH = 6
+#: frames that are compared; frames whose neighbours, _REACH before and after, are also compared
 _FRAMES, _DELAY_FRAMES = 10, 5
 #: frames from the start of the capture that are read: videos are decoded in order, so later frames take longer
 _SPAN = 600
@@ -181,20 +182,20 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
     """
     span = min(capture.frame_count, _SPAN)
     frames = np.unique(np.linspace(0, span - 1, _FRAMES).round().astype(int))
-    last = max(span - 1 - REACH, span // 4)
+    last = max(span - 1 - _REACH, span // 4)
     centers = np.unique(np.linspace(span // 4, last, _DELAY_FRAMES).round().astype(int)).tolist()
-    near = {i + s for i in centers for s in range(-REACH, REACH + 1)} & set(range(span))
+    near = {i + s for i in centers for s in range(-_REACH, _REACH + 1)} & set(range(span))
     kept = frames[np.linspace(0, len(frames) - 1, min(pictures, len(frames))).round().astype(int)]
     read = _read(capture, config, span, near | set(frames.tolist()), set(kept.tolist()))
     notes, small, masks = read.notes, read.small, read.masks
-    pairs = [(i + s, i + s + REACH) for i in centers for s in (-REACH, 0)]
+    pairs = [(i + s, i + s + _REACH) for i in centers for s in (-_REACH, 0)]
     given = [(small[i], small[k]) for i, k in pairs if capture.has_masks and i in small and k in small]
     unrelated = contradiction(given)
     compare = MaskAgreement(capture.rig, capture.volume)
     people, entered = read.watch.people(), read.watch.entered or 0
     if (later := frames >= entered).any():  # before it the masks show nobody, or people outside the volume
         kept, frames = kept[kept >= entered], frames[later]
-        centers = [i for i in centers if i - REACH >= entered] or centers
+        centers = [i for i in centers if i - _REACH >= entered] or centers
     agreement = compare.compare([masks[i] for i in frames.tolist()])
     if len(people) > 1:
         own = {index: read.watch.of_first(index, m) for index, m in masks.items()}
@@ -302,7 +303,7 @@ def _delays(
     C = len(compare.rig)
     small = {index: compare.small(m) for index, m in masks.items()}
     hulls = compare.hulls([compare.possible(masks[i]) for i in centers])
-    shifts = np.arange(-REACH, REACH + 1)
+    shifts = np.arange(-_REACH, _REACH + 1)
     late = np.zeros(C, np.int64)
     found = [
         best_shift(*_areas_by_shift(small, centers, hulls, [k for k in agreement.right if k != c], c, shifts))

@@ -20,7 +20,7 @@ from tk.trackers.contour_finder import SCREEN_ROWS
 # frames in which they are tried. A delay at the edge of the range is no optimum: the range is then doubled, at most to
 # MOST frames, which takes some seconds. A video is late if its share of wrong pixels is above the median camera's by
 # the first factor, and falls below the second without the delay. Two frames late at 15 Hz gave no delay without this.
-REACH, MOST, DELAY_FRAMES = 6, 96, 12
+REACH, MOST, DELAY_FRAMES = 5, 80, 12
 _WORSE, _MENDED = 1.3, 0.8
 # Least share of wrong pixels that is compared, a tenth of what correct cameras have: drawn masks have none.
 _EXACT = 0.01
