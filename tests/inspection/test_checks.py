@@ -145,6 +145,7 @@ def test_delay_is_certain_only_if_no_single_frame_decides_it() -> None:
     one = np.array([[9.0, 5.0, 4.0, 5.0, 9.0], [9.0, 5.0, 4.0, 5.0, 9.0], [90.0, 80.0, 70.0, 9.0, 60.0]])
     assert best_shift(one, area) == (1, pytest.approx((78 - 19) / 300), False)
     assert best_shift(np.ones((3, 5)), area) == (0, 0.0, True)
+    assert best_shift(np.roll(late, 1, axis=1), area)[:2] == (0, 0.0), "an optimum at the edge is none"
     assert best_shift(np.zeros((3, 5)), np.zeros((3, 5))) == (0, 0.0, True)
 
 

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 import tomli_w
 
-from tests.conftest import FRAMES, QUICK, Silent, Tk, track
+from tests.conftest import FITTED, FRAMES, QUICK, Silent, Tk, track
 from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tk.io import settings_file
 from tk.io.captures.calibration import read_calibration
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.captures.mask_store import MaskStore
-from tk.io.results.reader import read_result
+from tk.io.results.reader import read_joints, read_result
 from tk.io.results.status import Status
 from tk.io.toml import load_toml
 from tk.kernels.mask_values import OTHERS
@@ -34,6 +34,7 @@ from tk.model.cameras.refinement import turn_between
 from tk.run import offline as finish
 from tk.run.delays import retimed, whole_delays
 from tk.run.refined_calibration import refine_capture
+from tk.run.refinement import BetterCameras
 from tk.settings import Settings
 from tk.trackers.camera_monitor import CameraMonitor
 from tk.trackers.region import UNKNOWN_AFTER
@@ -44,10 +45,20 @@ TURNED = 1.0  # degrees, of cam2; a camera with a larger error is excluded
 @pytest.fixture(scope="module")
 def turned(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The tiny capture, its second camera turned by :data:`TURNED` degrees about its vertical."""
-    folder = Path(shutil.copytree(tiny, tmp_path_factory.mktemp("turned") / "capture"))
+    return with_turned_camera(tiny, tmp_path_factory.mktemp("turned"), TURNED)
+
+
+@pytest.fixture(scope="module")
+def turned_more(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same, turned so far that the camera is excluded."""
+    return with_turned_camera(tiny, tmp_path_factory.mktemp("turned"), 1.5 * TURNED)
+
+
+def with_turned_camera(tiny: Path, parent: Path, degrees: float) -> Path:
+    folder = Path(shutil.copytree(tiny, parent / "capture"))
     document = load_toml(folder / "calibration.toml")
     name = sorted(key for key in document if key != "metadata")[1]
-    turn = np.asarray(cv2.Rodrigues(np.radians([0.0, TURNED, 0.0]))[0])
+    turn = np.asarray(cv2.Rodrigues(np.radians([0.0, degrees, 0.0]))[0])
     table = document[name]
     table["rotation"] = cv2.Rodrigues(turn @ cv2.Rodrigues(np.array(table["rotation"]))[0])[0].ravel().tolist()
     table["translation"] = (turn @ np.array(table["translation"])).tolist()
@@ -118,7 +129,7 @@ def test_late_videos_are_tracked_again(tiny: Path, tmp_path: Path, monkeypatch: 
     asked: list[np.ndarray] = []
 
     def made_up(tracker: Any, *_: Any) -> Any:
-        return tracker, np.array([0.0, 0.0, 1.0, -1.0])
+        return BetterCameras(tracker, np.array([0.0, 0.0, 1.0, -1.0]), "refined")
 
     read = Capture.frames
 
@@ -127,6 +138,7 @@ def test_late_videos_are_tracked_again(tiny: Path, tmp_path: Path, monkeypatch: 
         return read(capture, *more)
 
     monkeypatch.setattr(finish, "refine_if_inconsistent", made_up)
+    monkeypatch.setattr(finish, "explains_better", lambda *_: True)
     monkeypatch.setattr(Capture, "frames", remember)
     path, reporter = tmp_path / "again.h5", Silent()
     assert track(open_capture(tiny), path, settings_file.from_toml(QUICK), reporter, frames=(2, None)).lost == 0
@@ -138,7 +150,34 @@ def test_late_videos_are_tracked_again(tiny: Path, tmp_path: Path, monkeypatch: 
     np.testing.assert_allclose(result.cameras.time_offset_s * open_capture(tiny).fps, [0, 0, 1, -1])
     # a camera that is late or early has no mask at an end
     assert result.residual is not None
-    assert np.isnan(result.residual[[0, -1], [2, 3]]).all() and np.isfinite(result.residual[1:-1]).all()
+    assert np.isnan(result.residual[[0, -1], [2, 3]]).all() and np.isfinite(result.residual[1:-1, :2]).all()
+
+
+def test_delays_that_explain_the_images_worse_are_not_used(
+    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The videos are synchronous; a delay of three frames is invented."""
+
+    def made_up(tracker: Any, *_: Any) -> Any:
+        return BetterCameras(tracker, np.array([0.0, 0.0, 3.0, 0.0]), "refined")
+
+    settings, path, reporter = settings_file.from_toml(QUICK), tmp_path / "again.h5", Silent()
+    track(open_capture(tiny), tmp_path / "plain.h5", settings)
+    monkeypatch.setattr(finish, "refine_if_inconsistent", made_up)
+    track(open_capture(tiny), path, settings, reporter)
+    result = read_result(path)
+    assert reporter.notes == [] and result.cameras is not None and not result.cameras.time_offset_s.any()
+    np.testing.assert_array_equal(result.joints, read_result(tmp_path / "plain.h5").joints)
+
+
+def test_excluded_camera_is_used_after_the_refinement(turned_more: Path, tiny: Path, tmp_path: Path) -> None:
+    path, reporter = tmp_path / "r.h5", Silent()
+    track(open_capture(turned_more), path, settings_file.from_toml(FITTED), reporter)
+    assert any("cam2" in note and "left out of frames 0 to 13" in note for note in reporter.notes)
+    assert "tracked again: no camera is left out" in reporter.notes
+    result, truth = read_result(path), read_joints(tiny / "truth.h5").positions
+    assert result.residual is not None and np.isfinite(result.residual).all()
+    assert np.linalg.norm(result.joints - truth, axis=-1).mean() < 0.05
 
 
 def test_result_without_a_body_and_bad_options_are_refused(tiny: Path, tracked: Path, tk: Tk, tmp_path: Path) -> None:
@@ -166,6 +205,19 @@ def test_videos_that_are_late_by_more_than_edges_reach_are_found(late: list[int]
     tracked = TrackedPoses(frames, poses, seen.any(axis=(2, 3)).all(axis=1))
     found = whole_delays(body, rig, seen.__getitem__, tracked)
     assert found.tolist() == late
+
+
+@pytest.mark.parametrize(("count", "found"), [(56, [0, 12, 0, 0]), (24, [0, 0, 0, 0])])
+def test_delay_at_the_edge_of_the_range_is_searched_farther_and_never_taken(count: int, found: list[int]) -> None:
+    """A video is twelve frames late. In 24 frames, no delay of that size can be tested."""
+    rig, body = ring_of_cameras(4, 160, 120), build_cone_body(BodyDimensions.from_stature(1.75))
+    frames = np.arange(count)
+    poses = np.array([gait.walking_pose(body.skeleton, i / 31 % 1) for i in frames])
+    poses[:, :3] = np.column_stack([0.03 * frames - 0.8, 0 * frames, 0 * frames + 0.95])
+    drawn = draw_silhouettes(body, rig, poses)
+    seen = np.array([[drawn[min(k + n, count - 1), c] for c, n in enumerate((0, 12, 0, 0))] for k in frames])
+    tracked = TrackedPoses(frames, poses, np.ones(count, np.bool_))
+    assert whole_delays(body, rig, seen.__getitem__, tracked).tolist() == found
 
 
 def test_an_excluded_camera_is_not_late() -> None:

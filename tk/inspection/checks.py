@@ -33,7 +33,6 @@ from tk.model.masks.image_shift import shift_between
 from tk.model.masks.mask_agreement import INCONSISTENT, Agreement, MaskAgreement
 from tk.model.masks.regions import clean_by_area
 from tk.model.masks.silhouettes import HOLE_SHARE
-from tk.run.delays import LARGEST_DELAY
 from tk.run.segmentation import make_labeller
 from tk.run.task import Task
 from tk.settings import Settings
@@ -44,7 +43,9 @@ Masks = NDArray[np.uint8]
 # These values decide which findings are printed, and no tracking result depends on them. With half and twice each value
 # the findings on walk, fold, rig9, pair and treadmill-slow are the same, except for specks in the ragged masks of
 # treadmill-slow (half the value names two cameras more, twice the value one fewer).
-#: frames that are compared; frames whose neighbours, LARGEST_DELAY before and after, are also compared
+#: largest shift of a video that is compared, frames; at the edge it is no optimum
+_REACH = 6
+#: frames that are compared; frames whose neighbours, _REACH before and after, are also compared
 _FRAMES, _DELAY_FRAMES = 10, 5
 #: frames that are read, from the first one that all cameras have: videos are decoded in order, so later frames take
 #: longer
@@ -188,20 +189,20 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
     span = range(first, min(capture.frame_count, first + _SPAN))
     frames = np.unique(np.linspace(first, span[-1], _FRAMES).round().astype(int))
     quarter = first + len(span) // 4
-    last = max(span[-1] - LARGEST_DELAY, quarter)
+    last = max(span[-1] - _REACH, quarter)
     centers = np.unique(np.linspace(quarter, last, _DELAY_FRAMES).round().astype(int)).tolist()
-    near = {i + s for i in centers for s in range(-LARGEST_DELAY, LARGEST_DELAY + 1)} & set(span)
+    near = {i + s for i in centers for s in range(-_REACH, _REACH + 1)} & set(span)
     kept = frames[np.linspace(0, len(frames) - 1, min(pictures, len(frames))).round().astype(int)]
     read = _read(capture, config, span, near | set(frames.tolist()), set(kept.tolist()))
     notes, small, masks = read.notes, read.small, read.masks
-    pairs = [(i + s, i + s + LARGEST_DELAY) for i in centers for s in (-LARGEST_DELAY, 0)]
+    pairs = [(i + s, i + s + _REACH) for i in centers for s in (-_REACH, 0)]
     given = [(small[i], small[k]) for i, k in pairs if capture.has_masks and i in small and k in small]
     unrelated = contradiction(given)
     compare = MaskAgreement(capture.rig, capture.volume)
     people, entered = read.watch.people(), read.watch.entered or 0
     if (later := frames >= entered).any():  # before it the masks show nobody, or people outside the volume
         kept, frames = kept[kept >= entered], frames[later]
-        centers = [i for i in centers if i - LARGEST_DELAY >= entered] or centers
+        centers = [i for i in centers if i - _REACH >= entered] or centers
     agreement = compare.compare([masks[i] for i in frames.tolist()])
     if len(people) > 1:
         own = {index: read.watch.of_first(index, m) for index, m in masks.items()}
@@ -311,7 +312,7 @@ def _delays(
     C = len(compare.rig)
     small = {index: compare.small(m) for index, m in masks.items()}
     hulls = compare.hulls([compare.possible(masks[i]) for i in centers])
-    shifts = np.arange(-LARGEST_DELAY, LARGEST_DELAY + 1)
+    shifts = np.arange(-_REACH, _REACH + 1)
     late = np.zeros(C, np.int64)
     found = [
         best_shift(*_areas_by_shift(small, centers, hulls, [k for k in agreement.right if k != c], c, shifts))
@@ -336,7 +337,7 @@ def _delays(
 def best_shift(outside: NDArray[np.float64], area: NDArray[np.float64]) -> tuple[int, float, bool]:
     """Return the shift that moves a camera's masks into the hull of the others, frames; by how much the share outside
     falls; and whether it is the same, to a frame, and not 0, without any one of the frames (jackknife). 0, 0.0 if none
-    does.
+    does: a shift at the edge of the range is no optimum.
 
     Args:
         outside, area: (N, S) area outside the hull and whole area, of N frames and shifts from -S // 2 to S // 2.
@@ -351,7 +352,9 @@ def _lowest(outside: NDArray[np.float64], area: NDArray[np.float64]) -> tuple[in
     share = np.where(area > 0, outside / np.maximum(area, 1), np.inf)
     best, middle = int(np.argmin(share)), len(share) // 2
     now, least = float(share[middle]), float(share[best])
-    return (best - middle, now - least) if _DELAY_LEAST < now < np.inf and least < _DELAY_GAIN * now else (0, 0.0)
+    inside = 0 < best < len(share) - 1
+    mended = _DELAY_LEAST < now < np.inf and least < _DELAY_GAIN * now
+    return (best - middle, now - least) if inside and mended else (0, 0.0)
 
 
 def _areas_by_shift(

@@ -30,8 +30,9 @@ from tk.run.member import Member
 from tk.run.people import People
 from tk.run.prefetch import open_observations
 from tk.run.refinement import compare_cameras, refine_if_inconsistent
+from tk.run.second_run import Run, Used, explains_better, track_again
 from tk.run.task import Task
-from tk.trackers.protocol import Estimate, Observation, TwoPassTracker, two_pass, without_cameras
+from tk.trackers.protocol import Estimate, TwoPassTracker, two_pass, without_cameras
 from tk.trackers.region import UNKNOWN_AFTER
 from tk.trackers.residual import contradicted
 
@@ -283,7 +284,7 @@ class _Finisher:
         """
         task, result = self.task, draft.result
         _LOG.info("second pass: comparing the cameras")
-        tracked = TrackedPoses(result.frames, result.pose, result.has_pose)
+        tracked = TrackedPoses(result.frames, draft.current("pose"), ~draft.lost)
         compared = masks.without(member.monitor.moved)
         agreement = compare_cameras(tracker, compared, tracked)
         if apart := "" if agreement is None else agreement.contradiction:
@@ -291,42 +292,61 @@ class _Finisher:
             draft.unclear = ~draft.lost
         if member.number:
             late = np.round((self.cameras.time_offset_s - task.source.time_offset_s) * task.setup.fps).astype(np.int64)
-            return tracker.with_cameras(self.cameras.rig), retimed(masks, result.frames, late)
+            taken = tracker.with_cameras(self.cameras.rig), retimed(masks, result.frames, late)
+            if self.cameras.rig is not task.setup.rig:
+                for line in self._track_again(member, draft, (tracker, masks), taken, late) or ():
+                    self.note(line)
+            return taken
         if agreement is None or apart or not task.settings.refine:
             return tracker, masks
-        refined = refine_if_inconsistent(tracker, agreement, compared, tracked, self.note)
+        refined = refine_if_inconsistent(tracker, agreement, compared, tracked)
         if refined is None:
             return tracker, masks
-        tracker, offsets = refined
-        masks = retimed(masks, result.frames, np.round(offsets).astype(np.int64))
-        self.cameras = UsedCameras(tracker.rig, self.cameras.time_offset_s + offsets / task.setup.fps)
-        if np.round(offsets).any() and self.alone:
-            self.note("tracking again: the images of the first pass were not synchronised")
-            self._track_again(tracker, masks, draft)
-        return tracker, masks
+        late = np.round(refined.offset_frames).astype(np.int64)
+        now = refined.tracker, retimed(masks, result.frames, late)
+        lines = self._track_again(member, draft, (tracker, masks), now, late)
+        if lines is None:
+            _LOG.info("the first pass explains the images better than one with the refined cameras")
+            return tracker, masks
+        for line in (refined.message, *lines):
+            self.note(line)
+        offsets = self.cameras.time_offset_s + refined.offset_frames / task.setup.fps
+        self.cameras = UsedCameras(refined.tracker.rig, offsets)
+        return now
 
-    def _track_again(self, tracker: TwoPassTracker, masks: MaskStore, draft: _Draft) -> None:
-        """Track the frames again of which every synchronised camera has an image, beginning at the first pass's pose;
-        none if the source cannot be read again. ``masks``: synchronised; they are not made again."""
-        result, source = draft.result, self.task.source.shifted(self.cameras.time_offset_s.tolist())
-        if source is None or source.frame_count is None:
-            return
-        present = np.flatnonzero(result.status != Status.ABSENT)
-        frames = result.frames[present]
-        begin = max(source.first_frame, int(frames[0]))
-        stop = min(source.frame_count, int(frames[-1]) + 1)
-        if begin >= stop:
-            return
-        tracker.start_at(result.pose[present][np.searchsorted(frames, begin)])
-        found = {}
-        with source.frames(begin, stop) as images:
-            for frame in images:
-                if frame.index in masks:
-                    observation = Observation(frame.index, frame.images, masks.get(frame.index), time=frame.time)
-                    found[frame.index] = replace(tracker.step(observation), masks=None, drawn=None)  # these are large
-                self.within((frame.index + 1 - begin) / (stop - begin))
-        again = np.isin(frames, list(found))
-        draft.replace(present[again], [found[int(frame)] for frame in frames[again]])
+    def _track_again(
+        self, member: Member, draft: _Draft, before: Used, now: Used, late: NDArray[np.int64]
+    ) -> list[str] | None:
+        """Track a person again with refined cameras and without delays, (C,) frames, if there are delays or a camera
+        was left out of many frames. Return lines for the user; None if the first pass, which then stays, explains the
+        images better.
+
+        With several people, the pixels of each are known with the delays only. A source that cannot be read again is
+        not tracked again.
+        """
+        task, result = self.task, draft.result
+        first = Run.of(before, result.frames, draft, np.flatnonzero(result.status != Status.ABSENT))
+        out = first.left_out()
+        source = task.source.shifted((np.array(task.source.time_offset_s) + late / task.setup.fps).tolist())
+        if source is None or source.frame_count is None or not (self.alone if late.any() else out.any()):
+            return []
+        _LOG.info("tracking again with the refined cameras")
+        done = track_again(first, now, source, task.setup, member.subject, self.within)
+        if done is None:
+            return None
+        found, monitor = done
+        rows = np.flatnonzero(np.isin(result.frames, list(found)))
+        again = replace(draft, lost=draft.lost.copy(), columns=dict(draft.columns))
+        again.replace(rows, [found[int(frame)] for frame in result.frames[rows]])
+        if not explains_better(Run.of(now, result.frames, again, rows), first):
+            return None
+        draft.lost, draft.columns = again.lost, again.columns
+        lines = ["tracking again: the images of the first pass were not synchronised"] if late.any() else []
+        if out.any():
+            names = ", ".join(np.array(task.setup.rig.names)[out])
+            lines.append(f"tracking again: with the refined cameras, {names} may be right")
+            lines += [f"tracked again: {line}" for line in monitor.report() or ["no camera is left out"]]
+        return lines if self.alone else [f"person {member.number}: {line}" for line in lines]
 
     def _judge(self, draft: _Draft, second_pass: bool) -> None:
         """Mark frames as suspect whose residual contradicts the pose; their sigma is unknown, as it is where the

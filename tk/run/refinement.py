@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -77,13 +76,24 @@ def compare_cameras(tracker: TwoPassTracker, store: MaskStore, tracked: TrackedP
     return camera_agreement(tracker.body, tracker.world.rig, chosen) if len(chosen) >= FEWEST else None
 
 
+@dataclass(frozen=True)
+class BetterCameras:
+    """Refined cameras of a tracked person.
+
+    Attributes:
+        tracker: with these cameras and the same body.
+        offset_frames: (C,) delay of each camera, frames.
+        message: what was refined, for the user.
+    """
+
+    tracker: TwoPassTracker
+    offset_frames: Float
+    message: str
+
+
 def refine_if_inconsistent(
-    tracker: TwoPassTracker,
-    agreement: CameraAgreement,
-    store: MaskStore,
-    tracked: TrackedPoses,
-    note: Callable[[str], None],
-) -> tuple[TwoPassTracker, Float] | None:
+    tracker: TwoPassTracker, agreement: CameraAgreement, store: MaskStore, tracked: TrackedPoses
+) -> BetterCameras | None:
     """Refine the cameras if they disagree about the tracked person; None if they agree, or refinement does not help.
 
     Args:
@@ -91,10 +101,6 @@ def refine_if_inconsistent(
         agreement: of :func:`compare_cameras`.
         store: the frames' masks.
         tracked: poses in the capture's world.
-        note: receives a message about the refined cameras.
-
-    Returns:
-        A tracker with the refined cameras and the same body, and the delay of each camera (C,), frames.
     """
     world = tracker.world
     tracked = replace(tracked, poses=world.poses_in(tracked.poses))
@@ -109,10 +115,10 @@ def refine_if_inconsistent(
         return None
     names, worst = world.rig.names, int(np.argmax(done.turn_deg))
     delays = [f"{name} is {n:+.2f} frames late" for name, n in zip(names, done.offset_frames, strict=True)
-            if abs(n) > LATE_FRAMES]  # fmt: skip
-    note(
+              if abs(n) > LATE_FRAMES]  # fmt: skip
+    message = (
         f"the cameras disagreed and are refined from {done.frame_count} frames: contours {before:.2f} px off, now "
         f"{after:.2f}; {', '.join([f'{names[worst]} is turned most, by {done.turn_deg[worst]:.2f}°', *delays])} "
         "(refine = false keeps them)"
     )
-    return tracker.with_cameras(world.rig_out(done.rig)), done.offset_frames
+    return BetterCameras(tracker.with_cameras(world.rig_out(done.rig)), done.offset_frames, message)

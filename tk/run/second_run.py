@@ -1,0 +1,158 @@
+"""Track a person a second time, with other cameras, and compare both runs by the same images.
+
+A camera that was left out is judged again, because cameras and delays have changed. The second run counts only if its
+poses explain the images better: every image of both runs is compared, also those of cameras that were left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from itertools import chain, islice
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import CaptureError
+from tk.io.captures.mask_store import MaskStore
+from tk.io.captures.source import Source
+from tk.kernels.mask_values import OTHERS, PERSON
+from tk.model.cues.ray_costs import RayGrid, residual_of
+from tk.model.setup import InitPose, Setup, Subject
+from tk.trackers.camera_monitor import CameraMonitor
+from tk.trackers.contour_finder import SCREEN_ROWS
+from tk.trackers.protocol import Estimate, Observation, TwoPassTracker, shows_person
+
+Float = NDArray[np.float64]
+
+# Frames in which two runs are compared, at most.
+_COMPARED = 40
+# A camera is judged again if the first run left it out of this share of the frames in which it shows the person.
+# Tracking again takes as long as the first pass.
+_LEFT_OUT = 0.1
+
+
+Used = tuple[TwoPassTracker, MaskStore]
+"""A tracker with the cameras of a run, and the masks of the frames with the delays of the run."""
+
+
+class Found(Protocol):
+    """What a run has found, by the datasets of a result; ``lost``: (F,) frames without a pose."""
+
+    lost: NDArray[np.bool_]
+
+    def current(self, dataset: str) -> Any:
+        """Return a dataset, such as "pose" (F, D) in the setup's world, or "residual" (F, C, 2)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Run:
+    """The frames of a run in which the person is present.
+
+    Attributes:
+        tracker, masks: see :data:`Used`.
+        frames: (F,) numbers of the frames.
+        poses: (F, D) in the setup's world.
+        lost: (F,) frames without a pose.
+        residual: (F, C, 2), NaN for a camera that was left out.
+    """
+
+    tracker: TwoPassTracker
+    masks: MaskStore
+    frames: NDArray[np.int64]
+    poses: Float
+    lost: NDArray[np.bool_]
+    residual: Float
+
+    @classmethod
+    def of(cls, used: Used, frames: NDArray[np.int64], found: Found, rows: NDArray[np.int64]) -> Run:
+        """Return some rows of what a run has found in frames (F,)."""
+        pose, residual = (found.current(dataset)[rows] for dataset in ("pose", "residual"))
+        return cls(*used, frames[rows], pose, found.lost[rows], residual)
+
+    def left_out(self) -> NDArray[np.bool_]:
+        """Return (C,) the cameras that show the person and were left out of a part of the frames."""
+        rows = np.flatnonzero(~self.lost)
+        shown = np.array([shows_person(self.masks.get(int(frame))) for frame in self.frames[rows]])
+        if not len(rows):
+            return np.zeros(self.residual.shape[1], np.bool_)
+        out = shown & np.isnan(self.residual[rows, :, 0])
+        return np.asarray(out.sum(axis=0) > _LEFT_OUT * shown.sum(axis=0))
+
+    def wrong_pixels(self, frames: NDArray[np.int64]) -> Float:
+        """Return (N, C) E_S of some frames (N,) by all cameras, at most 1; 1 in lost frames, NaN where nobody is
+        seen."""
+        tracker = self.tracker
+        grid = RayGrid(tracker.world.rig, SCREEN_ROWS)
+        rows = np.searchsorted(self.frames, frames)
+        poses = tracker.world.poses_in(self.poses[rows])
+        found = np.empty((len(frames), len(grid.rig)))
+        for k, frame in enumerate(frames.tolist()):
+            seen = grid.sample(self.masks.get(frame))
+            label = grid.render(tracker.body, poses[k][None]).label[0]
+            found[k] = residual_of(label > 0, seen >= PERSON, seen == OTHERS).sum(axis=1)
+        found[self.lost[rows]] = np.where(np.isnan(found[self.lost[rows]]), np.nan, 1.0)
+        return np.minimum(found, 1.0)
+
+
+def explains_better(second: Run, first: Run) -> bool:
+    """Return whether a run explains the images better than an earlier one: the mean share of wrong pixels, of the same
+    images, is lower."""
+    frames = np.intersect1d(second.frames, first.frames)
+    if not len(frames):
+        return False
+    frames = frames[np.unique(np.linspace(0, len(frames) - 1, _COMPARED).round().astype(int))]
+    new, old = second.wrong_pixels(frames), first.wrong_pixels(frames)
+    both = np.isfinite(new) & np.isfinite(old)
+    return bool(both.any() and new[both].mean() < old[both].mean())
+
+
+def track_again(
+    first: Run, now: Used, source: Source, setup: Setup, subject: Subject, within: Callable[[float], None]
+) -> tuple[Mapping[int, Estimate], CameraMonitor] | None:
+    """Track the frames of a run again in which every camera has an image, from its first pose on, and judge all cameras
+    anew; return the estimates by frame, and the monitor. None if nobody can be tracked so.
+
+    The body is fitted again if the run left out a camera.
+
+    Args:
+        first: the run.
+        now: the new cameras, and masks with the new delays, which are not made again.
+        source: with the new delays; its length is known.
+        setup: the scene.
+        subject: what is known of the person.
+        within: receives the share that is done.
+    """
+    (tracker, masks), frame_count = now, source.frame_count
+    assert frame_count is not None
+    shown = first.frames[~first.lost & (first.frames >= source.first_frame) & (first.frames < frame_count)]
+    if not len(shown):
+        return None
+    begin, stop = int(shown[0]), min(frame_count, int(first.frames[-1]) + 1)
+    pose = first.poses[np.searchsorted(first.frames, begin)]
+    monitor = CameraMonitor(tracker, replace(setup, rig=tracker.rig), subject)
+    found: dict[int, Estimate] = {}
+    with source.frames(begin, stop) as images:
+        frames = (
+            Observation(frame.index, frame.images, masks.get(frame.index), time=frame.time)
+            for frame in images
+            if frame.index in masks
+        )
+        opening = list(islice(frames, tracker.opening_frames))
+        try:
+            seen = monitor.start(opening)
+            if first.left_out().any():
+                given = dict(zip(tracker.pose_names, pose.tolist(), strict=True))
+                init = InitPose({}, given, height_m=subject.height_m or tracker.body.dimensions.stature)
+                tracker.start(seen, replace(subject, init=init))
+        except CaptureError:
+            return None
+        tracker.start_at(pose)
+        opening.reverse()
+        waiting = (opening.pop() for _ in range(len(opening)))  # images are large
+        for frame in chain(waiting, frames):
+            found[frame.index] = replace(monitor.step(frame)[0], masks=None, drawn=None)  # these are large
+            within((frame.index + 1 - begin) / (stop - begin))
+    return found, monitor
