@@ -28,8 +28,8 @@ from tk.io.captures.video import VideoClip, damaged_images
 from tk.io.paths import text_of
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import infer_volume, sample_box, views_of
-from tk.model.cameras.mounting import infer_up
-from tk.model.cameras.up import up_vector
+from tk.model.cameras.mounting import DEFAULT_UP, FoundUp
+from tk.model.cameras.up import shown, up_vector
 from tk.model.cameras.volume import Volume
 from tk.model.masks.image_health import described
 from tk.model.setup import Setup, Subject
@@ -55,8 +55,8 @@ _BACKGROUND_PIXELS, _BACKGROUND_BYTES = 50_000_000, 400_000_000
 #: most images of a video that are checked for damage after a camera has disagreed: about a millisecond each
 _CHECKED_IMAGES = 3000
 
-#: axis that points up if `capture.toml` gives none, unless the cameras' mounting differs by more than _UP_DEG degrees
-DEFAULT_UP, _UP_DEG = "z", 25.0
+#: if `capture.toml` gives no up direction, the default counts unless the cameras' mounting differs by more, degrees
+_UP_DEG = 25.0
 
 #: metres; a note asks for the unit if cameras are farther apart, because their positions may be in millimetres
 _FAR_APART_M = 100.0
@@ -288,7 +288,7 @@ def open_capture(
         path=path,
         name=settings.name or text_of(path.resolve().name),
         fps=fps,
-        up=_up(settings, rig, path, warnings.append),
+        up=_up(settings, calibration.mounting, path, warnings.append),
         rig=rig,
         volume=_working_volume(settings, rig, path, warnings.append),
         frame_count=frame_count,
@@ -383,14 +383,16 @@ def _common_length(clips: Sequence[Clip], late: Sequence[int], warn: Callable[[s
     return common
 
 
-def _up(settings: CaptureSettings, rig: Rig, path: Path, warn: Callable[[str], None]) -> str:
-    """Return the axis of `capture.toml`; if it gives none, z, unless the cameras' mounting indicates another one."""
+def _up(settings: CaptureSettings, found: FoundUp, path: Path, warn: Callable[[str], None]) -> str:
+    """Return the axis of `capture.toml`; if it gives none, z, unless most cameras are mounted along another one."""
     if settings.up is not None:
         return settings.up
-    found = infer_up(rig)
+    if not found.sure:
+        warn(f'{path / "capture.toml"}: gives no up, and {found.how}; write up = "{found.up}" if it is right')
+        return found.up
     if up_vector(found.up) @ up_vector(DEFAULT_UP) > np.cos(np.radians(_UP_DEG)):
         return DEFAULT_UP
-    warn(f"{path / 'capture.toml'}: gives no up; {found.up} is taken, {found.how}; tk level looks closer")
+    warn(f"{path / 'capture.toml'}: gives no up; {shown(found.up)} is taken, {found.how}; tk level looks closer")
     return found.up
 
 

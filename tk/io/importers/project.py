@@ -17,6 +17,7 @@ from tk.io.importers.files import matching
 from tk.io.importers.videos import CameraNames, find_clips
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import view_height
+from tk.model.cameras.mounting import FoundUp
 
 #: metres, least height of the views in which a person fits: a child of one metre, and a margin
 PERSON_VIEW_M = 1.2
@@ -30,10 +31,11 @@ class Project:
     source: Path  # calibration file or folder
     rig: Rig  # cameras with a video, metres. A width and height of 0 are unknown: the video's size is used.
     clips: tuple[Path, ...]  # video file or folder of images of each camera
+    up: FoundUp  # the world's up direction
     # masks, backgrounds: the same for masks and images of the empty scene; empty without any
     masks: tuple[Path, ...] = ()
     backgrounds: tuple[Path, ...] = ()
-    up: str | None = None  # the world's up direction if the format fixes it ("-y"), else None
+    turns: tuple[int, ...] = ()  # clockwise quarter turns after which each camera's image is upright; empty: none
     notes: tuple[str, ...] = ()  # lines for the user about what was inferred or left out
 
 
@@ -137,7 +139,8 @@ def read_format(form: Format, files: Sequence[Path], folder: Path, unit: str | N
         clips=tuple(clip for clip in found.clips if clip is not None),
         masks=_beside(folder, found.folder, ("masks", "mask"), chosen_names, notes),
         backgrounds=_beside(folder, found.folder, ("background", "backgrounds"), chosen_names, notes),
-        up=form.up,
+        up=FoundUp(form.up, f"as {form.tool} defines it") if form.up else calibration.mounting,
+        turns=tuple(calibration.turns[index] for index in chosen),
         notes=tuple(notes),
     )
 

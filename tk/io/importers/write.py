@@ -22,7 +22,6 @@ from tk.io.importers.project import Project
 from tk.io.paths import replacing, text_of
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import closest_to_axes, common_boxes
-from tk.model.cameras.mounting import FoundUp, infer_up
 from tk.model.cameras.up import up_text
 from tk.model.cameras.volume import Volume
 
@@ -53,9 +52,8 @@ def write_capture(project: Project, output: Path) -> Imported:
         raise CaptureError(f"{output}: exists already; remove it, or choose another name")
     notes = list(project.notes)
     rig = _fitted(_renamed(project.rig, notes), project.clips, notes)
-    found = FoundUp(project.up, f"as {project.tool} defines it") if project.up else infer_up(rig)
     volume, where = find_volume(rig)
-    notes.append(f"up = {_up_toml(found.up)}: {found.how}")
+    notes.append(f"up = {_up_toml(project.up.up)}: {project.up.how}")
     if volume is None:
         notes.append(where)
     else:
@@ -63,12 +61,13 @@ def write_capture(project: Project, output: Path) -> Imported:
         notes.append(f"[volume] center = {center}, size = {size} (metres): {where}")
 
     metadata = {"units": "m", "imported_from": f"{project.tool}, {text_of(project.source.name)}"}
-    tables = {camera.name: camera_table(camera) for camera in rig} | {"metadata": metadata}
-    settings = capture_toml(text_of(output.resolve().name), project, found, volume, where)
+    turns = project.turns or (0,) * len(rig)
+    tables = {camera.name: camera_table(camera, turn) for camera, turn in zip(rig, turns, strict=True)}
+    settings = capture_toml(text_of(output.resolve().name), project, volume, where)
     with replacing(output, CaptureError) as draft:
         shutil.rmtree(draft, ignore_errors=True)  # of an import that was killed
         draft.mkdir(parents=True)
-        (draft / "calibration.toml").write_text(tomli_w.dumps(tables), encoding="utf-8")
+        (draft / "calibration.toml").write_text(tomli_w.dumps({**tables, "metadata": metadata}), encoding="utf-8")
         (draft / "capture.toml").write_text(settings, encoding="utf-8")
         parts = {"videos": project.clips, "masks": project.masks, "background": project.backgrounds}
         copied = sum(_place(clips, rig.names, draft, folder) for folder, clips in parts.items() if clips)
@@ -116,13 +115,13 @@ def _rounded(volume: Volume) -> Volume:
     return Volume((center[0], center[1], center[2]), (size[0], size[1], size[2]))
 
 
-def capture_toml(name: str, project: Project, up: FoundUp, volume: Volume | None, where: str) -> str:
+def capture_toml(name: str, project: Project, volume: Volume | None, where: str) -> str:
     """Return the text of `capture.toml`: each inferred value with a comment on how it was inferred."""
     lines = [
         f"# imported from {project.tool}, {text_of(project.source.name)}",
         tomli_w.dumps({"name": name}).strip(),
-        f"# up: {up.how}",
-        f"up = {_up_toml(up.up)}",
+        f"# up: {project.up.how}",
+        f"up = {_up_toml(project.up.up)}",
         "",
     ]
     if volume is None:

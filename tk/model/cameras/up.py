@@ -59,6 +59,11 @@ def up_text(up: str | Sequence[float] | Float) -> str:
     return json.dumps([float(value) for value in vector])
 
 
+def shown(up: str) -> str:
+    """Return the text of a direction for messages: a vector with three digits."""
+    return up if up in UP_AXES else f"[{', '.join(f'{value + 0.0:.3f}' for value in up_vector(up).round(3))}]"
+
+
 def _unit(values: ArrayLike) -> Float:
     try:
         vector = np.asarray(values, dtype=np.float64)
