@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import CaptureError, VideoError, VolumeError
+from tk.errors import CalibrationError, CaptureError, VideoError, VolumeError
 from tk.io.captures.calibration import Calibration, match_camera, read_calibration
 from tk.io.captures.capture_toml import CaptureSettings, GivenSubject, read_settings
 from tk.io.captures.clip import Clip, Image
@@ -27,7 +27,7 @@ from tk.io.captures.timing import resample as resampled
 from tk.io.captures.video import VideoClip, damaged_images
 from tk.io.paths import text_of
 from tk.model.cameras.camera import Camera, Rig
-from tk.model.cameras.common_view import infer_volume, sample_box, views_of
+from tk.model.cameras.common_view import all_look_away, infer_volume, sample_box, views_of
 from tk.model.cameras.mounting import DEFAULT_UP, FoundUp
 from tk.model.cameras.up import shown, up_vector
 from tk.model.cameras.volume import Volume
@@ -403,11 +403,15 @@ def _working_volume(settings: CaptureSettings, rig: Rig, path: Path, warn: Calla
         try:
             volume = infer_volume(rig)
         except VolumeError as reason:
+            if away := all_look_away(rig):
+                raise CalibrationError(f"{path / 'calibration.toml'}: {away}") from None
             raise VolumeError(f"{file}: gives no [volume], and none can be inferred: {reason}; add one") from None
         center, size = ([round(x, 2) for x in values] for values in (volume.center, volume.size))
         warn(f"{file}: gives no [volume]; inferred from the cameras: center = {center}, size = {size} (metres)")
         return volume
     if not (views_of(rig, sample_box(settings.volume)) >= 2).any():
+        if away := all_look_away(rig):
+            raise CalibrationError(f"{path / 'calibration.toml'}: {away}")
         raise VolumeError(
             f"{file}: [volume]: no two cameras see center = {list(settings.volume.center)}, "
             f"size = {list(settings.volume.size)}; move it (metres), or check the units in calibration.toml"

@@ -21,12 +21,15 @@ from tk.io.captures.pictures import PICTURE_SUFFIXES
 from tk.io.importers.project import Project
 from tk.io.paths import replacing, text_of
 from tk.model.cameras.camera import Camera, Rig
-from tk.model.cameras.common_view import closest_to_axes, common_boxes
+from tk.model.cameras.common_view import all_look_away, closest_to_axes, common_boxes
 from tk.model.cameras.up import up_text
 from tk.model.cameras.volume import Volume
 
 #: least side of a working volume, metres: a person with arms spread needs more
 _ROOM_M = 1.5
+#: a size with fractions was computed from something else (Pose2Sim: from the principal point); it is off by less than
+#: this share of the image
+_ROUGH = 0.15
 #: codecs pad images to blocks of 16 pixels: a smaller difference in size is padding, removed or kept
 _BLOCK = 16
 
@@ -51,8 +54,10 @@ def write_capture(project: Project, output: Path) -> Imported:
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise CaptureError(f"{output}: exists already; remove it, or choose another name")
     notes = list(project.notes)
-    rig = _fitted(_renamed(project.rig, notes), project.clips, notes)
+    rig = _fitted(_renamed(project.rig, notes), project, notes)
     volume, where = find_volume(rig)
+    if volume is None and (away := all_look_away(rig)):
+        raise CalibrationError(f"{project.source}: {away}")
     notes.append(f"up = {_up_toml(project.up.up)}: {project.up.how}")
     if volume is None:
         notes.append(where)
@@ -165,11 +170,21 @@ def _renamed(rig: Rig, notes: list[str]) -> Rig:
     return Rig(tuple(cameras))
 
 
-def _fitted(rig: Rig, clips: Sequence[Path], notes: list[str]) -> Rig:
+def _fitted(rig: Rig, project: Project, notes: list[str]) -> Rig:
+    """Return the cameras with the sizes of their videos."""
     cameras = []
-    for camera, clip in zip(rig, clips, strict=True):
+    written = project.fractional or (None,) * len(rig)
+    for camera, clip, size in zip(rig, project.clips, written, strict=True):
         found = probe(clip)
-        fitted, note = fit_size(camera, found.width, found.height, clip)
+        shape = found.width, found.height
+        if size and all(abs(a - b) < _ROUGH * b for a, b in zip(size, shape, strict=True)):
+            fitted = replace(camera, width=found.width, height=found.height)
+            note: str | None = (
+                f"camera {camera.name!r}: its size in the calibration, {size[0]:.1f}×{size[1]:.1f}, is not an image's; "
+                f"the video's is used, {found.width}×{found.height}"
+            )
+        else:
+            fitted, note = fit_size(camera, *shape, clip)
         if note:
             notes.append(note)
         cameras.append(fitted)
