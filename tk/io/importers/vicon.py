@@ -67,6 +67,8 @@ def _add(found: Tables, item: Element, name: str) -> None:
     cx, cy = key_frame.array("PRINCIPAL_POINT", (2,))
     if not aspect > 0 or not focal > 0:
         device.fail(f"FOCAL_LENGTH = {focal:g}, PIXEL_ASPECT_RATIO = {aspect:g} must be positive")
+    if skew := device.number("SKEW", 0.0):
+        device.fail(f"SKEW = {skew:g}: a skewed sensor in this format is not supported; calibrate without skew")
     quaternion = key_frame.array("ORIENTATION", (4,))
     if np.linalg.norm(quaternion) < 1e-6:
         key_frame.fail("ORIENTATION is not a rotation: its four numbers are zero")
