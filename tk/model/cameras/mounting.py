@@ -83,6 +83,7 @@ def infer_up(rig: Rig, turns: Sequence[int] = ()) -> FoundUp:
         roll_deg = float(np.degrees(np.sqrt(max(values[0], 0.0) / len(right))))
         level = roll_deg <= _ROLLED_DEG
         estimates = [second] if level else [*estimates, second]
+        level &= len(right) > 2  # two directions always span a plane
 
     own = next((camera.name for camera in rig if _is_world(camera)), None)
     if own is not None:
