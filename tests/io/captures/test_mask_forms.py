@@ -139,6 +139,12 @@ def test_picture_that_is_no_mask_is_refused(tmp_path: Path, form: str) -> None:
         read(path)
 
 
+def test_inverted_masks_are_refused(tmp_path: Path) -> None:
+    write_picture(tmp_path / "000000.png", 255 - TRUE)
+    with refused(VideoError, tmp_path / "000000.png", "is white along its edges", "invert the masks"):
+        read(tmp_path / "000000.png")
+
+
 def test_second_label_in_a_later_picture_is_refused(tmp_path: Path) -> None:
     for k, value in enumerate((1, 1, 2)):
         write_picture(tmp_path / "cam1" / f"{k:06d}.png", BODY.astype(np.uint8) * value)

@@ -29,6 +29,8 @@ _COLORED = 0.02
 _PHOTO_VALUES, _PHOTO_RANGE = 32, 32
 #: the middle of the person: this share of the largest distance from the edge, and more
 _MIDDLE = 0.6
+#: a mask that is white along more of its edges, and not everywhere, is inverted
+_INVERTED = 0.9
 #: values up to this one are black, in the last two tests
 _BLACK = 8
 
@@ -71,8 +73,14 @@ class MaskForm:
             return _binary(grey)
         if grey.max() < PERSON or (not soft and len(present) > _PHOTO_VALUES and _is_photograph(grey)):
             raise _not_a_mask(decoded, path)
+        mask = _binary(grey)
+        edge = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+        if edge.mean() > _INVERTED * 255 and not mask.all():
+            raise VideoError(
+                f"{path}: is white along its edges: people must be white (255), the rest black (0); invert the masks"
+            )
         self._white = True
-        return _binary(grey)
+        return mask
 
     def _labels(self, labels: NDArray[Any], decoded: NDArray[Any], path: Path) -> Image:
         """Return the mask of labels (H, W) of one object, which is the same in all pictures, on 0."""
