@@ -3,8 +3,9 @@
     python -m scripts.calibrate_cameras --print board.png
     python -m scripts.calibrate_cameras boards --square 0.11 -o CAPTURE/calibration.toml
 
-boards/<camera>/<n>.png: pictures with the same n show the board at the same moment, or where it lies still. The first n
-shows it flat on the floor. Some 20 places seen by two cameras and more, and 10 close to each camera, are enough.
+boards/<camera>/<n>.png (or .jpg): pictures with the same n show the board at the same moment, or where it lies still.
+The first n shows it flat on the floor. Some 20 places seen by two cameras and more, and 10 close to each camera, are
+enough.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ import tomli_w
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from tk.io.captures.pictures import PICTURE_SUFFIXES, picture_number
+
 Float = NDArray[np.float64]
 Pose = tuple[Any, Any]
 """Rodrigues vector (3, 1) and translation (3, 1), metres, as OpenCV's `composeRT` takes them."""
@@ -28,6 +31,8 @@ Pose = tuple[Any, Any]
 SQUARES = (7, 5)
 MARKER_SHARE = 0.75  # side of a marker, share of a square's
 FEWEST_CORNERS = 8  # of 24: below this a picture of the board is not used
+#: metres, range of the side of a square
+SQUARES_M = (0.005, 1.0)
 #: one focal length, two radial terms: what some ten pictures a camera determine
 LENS = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_ASPECT_RATIO
 #: OpenCV's board has z into the paper: the floor's z points up
@@ -51,12 +56,14 @@ def calibrate(folder: Path, square_m: float) -> tuple[dict[str, dict[str, Any]],
     cameras: dict[str, dict[str, Any]] = {}
     seen: dict[tuple[str, int], Sequence[Float]] = {}  # corners on the board (N, 3), in the picture (N, 2)
     for own in sorted(path for path in folder.iterdir() if path.is_dir()):
-        for file in sorted(own.glob("*.png")):
+        for number, file in _pictures(own).items():
             gray = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+            if gray is None:
+                raise ValueError(f"{file}: is not a picture that can be decoded")
             corners, ids, _, _ = detector.detectBoard(gray)
             if ids is not None and len(ids) >= FEWEST_CORNERS:
                 points, pixels = board.matchImagePoints(corners, ids)
-                seen[own.name, int(file.stem)] = points.reshape(-1, 3), pixels.reshape(-1, 2)
+                seen[own.name, number] = points.reshape(-1, 3), pixels.reshape(-1, 2)
         views = [both for (name, _), both in seen.items() if name == own.name]
         if not views:
             raise ValueError(f"{own}: the board is found in none of its pictures")
@@ -64,7 +71,9 @@ def calibrate(folder: Path, square_m: float) -> tuple[dict[str, dict[str, Any]],
         size = gray.shape[::-1]
         _, matrix, distortions, _, _ = cv2.calibrateCamera(points, pixels, size, None, None, flags=LENS)
         cameras[own.name] = {"size": list(size), "matrix": matrix, "distortions": distortions.ravel()}
-    floor = min(int(file.stem) for file in folder.glob("*/*.png"))
+    if not cameras:
+        raise ValueError(f"{folder}: holds no folder of pictures; it needs one a camera")
+    floor = min(number for name in cameras for number in _pictures(folder / name))
     if not any((name, floor) in seen for name in cameras):
         raise ValueError(f"no camera finds the board in picture {floor}, on the floor: lay it nearer to a camera")
     seen = {(c, n): both for (c, n), both in seen.items() if n == floor or sum((d, n) in seen for d in cameras) > 1}
@@ -103,6 +112,19 @@ def calibrate(folder: Path, square_m: float) -> tuple[dict[str, dict[str, Any]],
     return cameras, float(np.median(np.linalg.norm(residuals(x).reshape(-1, 2), axis=1)))
 
 
+def _pictures(folder: Path) -> dict[int, Path]:
+    """Return the pictures in a folder, by their number."""
+    found: dict[int, Path] = {}
+    for file in sorted(folder.iterdir()):
+        if file.suffix.lower() not in PICTURE_SUFFIXES or file.name.startswith("."):
+            continue
+        number = picture_number(file)
+        if number is None or number in found:
+            raise ValueError(f"{file}: needs a number at the end of its name, and one that no other picture has")
+        found[number] = file
+    return found
+
+
 def _inverse(pose: Pose) -> Pose:
     rotation, translation = pose
     return -rotation, -cv2.Rodrigues(rotation)[0].T @ translation
@@ -121,6 +143,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     if options.boards is None:
         parser.error("give the folder of the pictures, or --print")
+    if not SQUARES_M[0] <= options.square <= SQUARES_M[1]:
+        sys.exit(
+            f"--square {options.square:g}: the side of a square is in metres, {SQUARES_M[0]:g} to {SQUARES_M[1]:g}; "
+            "divide millimetres by 1000"
+        )
     try:
         cameras, error = calibrate(options.boards, options.square)
     except ValueError as problem:

@@ -25,6 +25,7 @@ from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.model.cameras.camera import Rig
+from tk.model.cameras.mounting import FoundUp, infer_up
 from tk.model.cameras.up import up_vector
 
 
@@ -199,7 +200,7 @@ def standing(count: int = 8) -> list[np.ndarray]:
 def test_up_is_estimated_in_a_rotated_world(seed: int) -> None:
     R = Rotation.random(random_state=seed).as_matrix()
     rig = Rig(tuple(replace(c, rotation=c.rotation @ R.T) for c in ring_of_cameras(4, 160, 120)))
-    found = find_up(rig, "z", [hull @ R.T for hull in standing()])
+    found = find_up(infer_up(rig), "z", [hull @ R.T for hull in standing()])
     assert np.degrees(np.arccos(up_vector(found.up) @ R[:, 2])) < 1.5
     assert abs(found.floor_m) < 0.1
 
@@ -209,8 +210,8 @@ def test_standing_person_overrules_cameras_mounted_sideways() -> None:
     cameras = []
     for c in ring_of_cameras(4, 160, 120):
         cameras.append(replace(c, rotation=quarter @ c.rotation, translation=quarter @ c.translation))
-    found = find_up(Rig(tuple(cameras)), "z", standing())
-    assert up_vector(found.up)[2] > np.cos(np.radians(3.0))
+    found = find_up(infer_up(Rig(tuple(cameras))), "z", standing())
+    assert found.up == "z" and found.decided
 
 
 def test_level_writes_up_and_keeps_the_rest(tk: Tk, copy: Path) -> None:
@@ -265,3 +266,41 @@ def test_broken_capture_toml_is_not_changed(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match=r"capture.toml: invalid TOML"):
         write_up(tmp_path, Leveling("z", "how", 0.0, ""))
     assert (tmp_path / "capture.toml").read_text() == "up = \n"
+
+
+UPRIGHT = infer_up(ring_of_cameras(4, 160, 120))
+UNSURE = FoundUp("z", "mounted differently", sure=False)
+LYING = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+
+
+def test_person_who_lies_changes_no_up_direction() -> None:
+    hulls = [hull @ LYING.T for hull in standing()]
+    found = find_up(UPRIGHT, "z", hulls)
+    assert (found.up, found.decided) == ("z", True) and "who may lie or sit, differs by 9" in found.how
+    for cameras, given in ((UNSURE, "z"), (UPRIGHT, "x"), (UPRIGHT, "y"), (UPRIGHT, "[0.6, 0.8, 0.0]")):
+        found = find_up(cameras, given, hulls)
+        assert (found.up, found.decided) == (given, False) and found.how.startswith("it cannot be decided: ")
+
+
+def test_two_people_are_no_vertical() -> None:
+    pairs = [np.concatenate([hull, hull + np.array([2.5, 0.0, 0.0])]) for hull in standing()]
+    for one_person, wide in ((False, standing()), (True, pairs)):
+        found = find_up(UNSURE, "z", wide, one_person)
+        assert (found.up, found.person, found.decided) == ("z", "", False)
+        assert find_up(UPRIGHT, "z", wide, one_person).decided
+
+
+def test_rolled_cameras_alone_do_not_overrule_up() -> None:
+    rolled = FoundUp("[0.0, -0.6, 0.8]", "the mean", level=False)
+    assert not find_up(rolled, "z", []).decided
+    assert find_up(replace(rolled, level=True), "z", []).up == "[0.0, -0.6, 0.8]"
+
+
+def test_level_writes_nothing_that_is_not_decided(tk: Tk, copy: Path) -> None:
+    """The cameras hang on their side, and up is wrong: the person does not stand along it."""
+    quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    rig = open_capture(copy).rig
+    turned = [replace(c, rotation=quarter @ c.rotation, translation=quarter @ c.translation) for c in rig]
+    with pytest.raises(CaptureError, match=r"up = y stays: it cannot be decided: .*; write the right one yourself"):
+        write_up(copy, find_up(infer_up(Rig(tuple(turned))), "y", standing()))
+    assert 'up = "z"' in (copy / "capture.toml").read_text()

@@ -19,7 +19,7 @@ DERIVATIVE = 1e-5
 def _project_kernel(real):
     @ti.kernel
     def kernel(
-        camera: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
+        camera: ti.types.ndarray(dtype=real, ndim=2),  # (V, 26)
         view: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,)
         world: ti.types.ndarray(dtype=real, ndim=2),  # (N, 3)
         pixels: ti.types.ndarray(dtype=real, ndim=2),  # (N, 2) out
@@ -44,7 +44,7 @@ def project_points(
     """Project points, each by a camera of its own.
 
     Args:
-        cameras: (V, 22) rows of :func:`pack_cameras`.
+        cameras: (V, 26) rows of :func:`pack_cameras`.
         view: (N,) which camera.
         p_world: (N, 3) metres, float32 or float64: the precision of the computation.
 
@@ -66,10 +66,10 @@ def project_points(
     return pixels, jacobian, depth
 
 
-def camera_of(fisheye: bool, distortions) -> Camera:
+def camera_of(fisheye: bool, distortions, skew: float = 0.0) -> Camera:
     angle = 0.4
     rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-    matrix = np.array([[510.0, 0, 300], [0, 495.0, 210], [0, 0, 1]])
+    matrix = np.array([[510.0, skew, 300], [0, 495.0, 210], [0, 0, 1]])
     return Camera("c", 640, 480, matrix, np.array(distortions), rotation, np.array([0.1, -0.2, 3.0]), fisheye)
 
 
@@ -79,8 +79,11 @@ def camera_of(fisheye: bool, distortions) -> Camera:
         camera_of(False, [0.0, 0, 0, 0]),
         camera_of(False, [-0.2, 0.05, 1e-3, -2e-3, 0.01]),
         camera_of(True, [0.02, -0.01, 3e-3, -1e-3]),
+        camera_of(False, [0.5, -2.6, 6e-4, -4e-4, 1.5, 0.45, -2.45, 1.42]),
+        camera_of(False, [-0.2, 0.05, 1e-3, -2e-3], skew=25.0),
+        camera_of(True, [0.02, -0.01, 3e-3, -1e-3], skew=-9.0),
     ],
-    ids=["pinhole", "brown", "fisheye"],
+    ids=["pinhole", "brown", "fisheye", "rational", "skew", "fisheye and skew"],
 )
 def test_projection_is_opencvs(camera):
     p = np.random.default_rng(3).uniform(-0.9, 0.9, (80, 3))

@@ -29,6 +29,7 @@ def camera(angle_deg: float, height_m: float) -> tuple[Float, Float]:
 
 
 CAMERAS = {"left": camera(0.0, 2.0), "right": camera(60.0, 1.8)}
+SUFFIX = {"left": ".png", "right": ".JPG"}
 
 
 def write_picture(file: Path, rotation: Float, translation: Float) -> None:
@@ -57,12 +58,12 @@ def boards(tmp_path_factory: pytest.TempPathFactory) -> Path:
             turn = cv2.Rodrigues(rng.uniform(-0.4, 0.4, 3))[0] @ np.stack([x, np.cross(z, x), z], axis=1)
             place = np.append(rng.uniform(-0.3, 0.3, 2), rng.uniform(0.6, 1.3)) - turn @ middle
         for name, (rotation, translation) in CAMERAS.items():
-            write_picture(folder / name / f"{n:04d}.png", rotation @ turn, rotation @ place + translation)
+            write_picture(folder / name / f"{n:04d}{SUFFIX[name]}", rotation @ turn, rotation @ place + translation)
     for k, name in enumerate(CAMERAS):
         for n in range(10 * k + 10, 10 * k + 15):
             turn = cv2.Rodrigues(rng.uniform(-0.6, 0.6, 3))[0]
             place = np.array([rng.uniform(-0.2, 0.2), rng.uniform(-0.15, 0.15), 1.0]) - turn @ middle
-            write_picture(folder / name / f"{n:04d}.png", turn, place)
+            write_picture(folder / name / f"{n:04d}{SUFFIX[name]}", turn, place)
     return folder
 
 
@@ -83,10 +84,28 @@ def test_board_that_no_camera_sees_on_the_floor_is_an_error(boards: Path, tmp_pa
     for name in CAMERAS:
         (tmp_path / name).mkdir()
         cv2.imwrite(str(tmp_path / name / "0000.png"), np.full(SIZE[::-1], 128, np.uint8))
-        picture = boards / name / "0001.png"
-        (tmp_path / name / "0001.png").write_bytes(picture.read_bytes())
+        picture = boards / name / f"0001{SUFFIX[name]}"
+        (tmp_path / name / picture.name).write_bytes(picture.read_bytes())
     with pytest.raises(SystemExit, match="on the floor: lay it nearer"):
         main([str(tmp_path), "-o", str(tmp_path / "calibration.toml")])
+
+
+@pytest.mark.parametrize("square", [200, 11, 0.0002, -0.1, float("nan")])
+def test_square_that_is_not_in_metres_is_refused(tmp_path: Path, square: float) -> None:
+    with pytest.raises(SystemExit, match="the side of a square is in metres"):
+        main([str(tmp_path), f"--square={square}", "-o", str(tmp_path / "calibration.toml")])
+
+
+def test_folder_without_pictures_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="holds no folder of pictures"):
+        main([str(tmp_path)])
+    (tmp_path / "cam1").mkdir()
+    (tmp_path / "cam1" / "0000.jpeg").write_bytes(b"x")
+    with pytest.raises(SystemExit, match="is not a picture that can be decoded"):
+        main([str(tmp_path)])
+    (tmp_path / "cam1" / "board.jpeg").write_bytes(b"x")
+    with pytest.raises(SystemExit, match=r"board\.jpeg: needs a number"):
+        main([str(tmp_path)])
 
 
 def test_board_is_written_for_printing(tmp_path: Path) -> None:

@@ -20,9 +20,9 @@ def level(capture: Path, masks: str, resample: bool | None, config_file: Path | 
         from tk.inspection.checks import inspect as check
         from tk.inspection.leveling import write_up
         from tk.io.importers import open_recording
-        from tk.model.cameras.up import shown_up
+        from tk.model.cameras.up import shown
 
         settings = base.load_settings(config_file, resample=resample)
         found, _ = check(open_recording(capture, None, masks, settings.resample), settings, pictures=0)
         write_up(capture, found.leveling)
-    click.echo(f"up = {shown_up(found.leveling.up)} in {capture / 'capture.toml'}: {found.leveling.how}")
+    click.echo(f"up = {shown(found.leveling.up)} in {capture / 'capture.toml'}: {found.leveling.how}")

@@ -25,7 +25,7 @@ from tk.io.captures.video import odd_turn
 from tk.kernels.mask_values import PERSON
 from tk.model.body.plausibility import fits_height
 from tk.model.cameras.common_view import sample_box, views_of
-from tk.model.cameras.up import shown_up, up_vector
+from tk.model.cameras.up import shown, up_vector
 from tk.model.cameras.volume import Volume
 from tk.model.hull.coarse import Hull
 from tk.model.masks.image_health import MOST_SHIFT, ImageHealth, Sampled, contradiction, sampled
@@ -145,7 +145,7 @@ class Inspection:
             "",
             f"volume: all cameras see {self.seen_by_all:.0%} of it, at least two see {self.seen_by_two:.0%}; "
             f"{self.at_border:.1%} of the person is at its border",
-            f"up: {shown_up(self.leveling.up)}, {self.leveling.how}",
+            f"up: {shown(self.leveling.up)}, {self.leveling.how}",
             f"floor: {self.leveling.floor_m:+.2f} m along up"
             if np.isfinite(self.leveling.floor_m)
             else "floor: not found",
@@ -233,7 +233,7 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
         seen_by_all=float((views == len(capture.rig)).mean()),
         seen_by_two=float((views >= 2).mean()),
         at_border=_at_border(capture.volume, points),
-        leveling=find_up(capture.rig, capture.up, points),
+        leveling=find_up(capture.calibration.mounting, capture.up, points, len(people) < 2),
         people=people,
         findings=(),
         notes=tuple(notes),
@@ -482,11 +482,12 @@ def _findings(found: Inspection, capture: Capture, agreement: Agreement) -> list
     height = capture.subject_height_m
     if height and not fits_height(found.extent_m, height):
         lines.append(f"the person measures {found.extent_m:.2f} m, but [subject] height is {height:.2f} m")
+    if found.leveling.person and not found.leveling.decided:
+        lines.append(f"up = {shown(capture.up)}: {found.leveling.how}")
     tilt = np.degrees(np.arccos(np.clip(capture.up_axis @ up_vector(found.leveling.up), -1.0, 1.0)))
     if tilt > _TILTED_DEG:
         lines.append(
-            f"up = {shown_up(capture.up)} differs by {tilt:.0f}° from the estimate from cameras and person, "
-            f"{shown_up(found.leveling.up)}: "
-            "tk level writes the estimate to capture.toml"
+            f"up = {shown(capture.up)} differs by {tilt:.0f}° from the estimate from cameras and person, "
+            f"{shown(found.leveling.up)}: tk level writes the estimate to capture.toml"
         )
     return lines

@@ -1,8 +1,10 @@
-"""Estimate the up direction and the floor from the orientation of the cameras and the standing person.
+"""Estimate the up direction and the floor from the mounting of the cameras and the standing person.
 
 Cameras are often mounted upright (:func:`tk.model.cameras.mounting.infer_up`), and the longest axis of a standing
-person is vertical. The estimate is the mean of both, weighted by their variances. On five captures in randomly rotated
-worlds its error was 1.2° to 2.5°.
+person is vertical. If both agree, the estimate is their mean, weighted by their variances. On five captures in randomly
+rotated worlds its error was 1.2° to 2.5°. The axis of somebody who lies, sits or rides is not vertical, and cameras may
+hang on their side: of two sources that contradict each other neither counts, unless the capture's own up direction
+confirms the cameras.
 """
 
 from __future__ import annotations
@@ -18,9 +20,8 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError
 from tk.io.paths import replacing
 from tk.io.toml import parse_toml, read_text
-from tk.model.cameras.camera import Rig
-from tk.model.cameras.mounting import infer_up
-from tk.model.cameras.up import UP_AXES, up_text, up_vector
+from tk.model.cameras.mounting import FoundUp
+from tk.model.cameras.up import UP_AXES, shown, up_text, up_vector
 
 Float = NDArray[np.float64]
 
@@ -28,10 +29,14 @@ Float = NDArray[np.float64]
 # the floor changes by 4 cm at most, and with twice the first one nobody in rig9 is taken for a standing person.
 #: least ratio of the largest two standard deviations of a standing person's voxels; people who crouch have less
 _LONG = 1.6
+#: metres, largest second standard deviation of one person's voxels: several people, or a table, are wider
+_WIDE_M = 0.35
 #: standard deviations of the up direction, degrees: from level cameras, from rolled cameras, from a standing person
 _LEVEL_DEG, _ROLLED_DEG, _LEANING_DEG = 2.0, 8.0, 1.5
-#: if cameras and person differ more, degrees, they are not averaged
+#: if two directions differ more, degrees, they contradict each other
 _AGREE_DEG = 25.0
+#: without a person, cameras that are rolled do not contradict a direction that differs less, degrees
+_UNSURE_DEG = 10.0
 #: percentile of the voxels' heights that is the floor; lower voxels come from specks in the masks
 _FLOOR_PERCENTILE = 0.5
 
@@ -43,57 +48,81 @@ class Leveling:
     """The estimate.
 
     Attributes:
-        up: up direction, as text of :func:`tk.model.cameras.up.up_text`.
-        how: how it was estimated, as text.
+        up: up direction, as text of :func:`tk.model.cameras.up.up_text`; the given one if it cannot be decided.
+        how: how it was estimated, or why it cannot be decided, as text.
         floor_m: height of the floor along ``up`` from the world's origin, metres; NaN without a person.
         person: mean longest axis of the person, as text; empty if nobody stands.
+        decided: whether the sources agree.
     """
 
     up: str
     how: str
     floor_m: float
     person: str
+    decided: bool = True
 
 
-def find_up(rig: Rig, given: str, hulls: Sequence[Float]) -> Leveling:
+def find_up(cameras: FoundUp, given: str, hulls: Sequence[Float], one_person: bool = True) -> Leveling:
     """Estimate the up direction.
 
     Args:
-        rig: the cameras.
-        given: the capture's up direction; it decides the sign of the person's axis if the cameras do not.
-        hulls: points (N, 3) of the person in some frames, metres.
+        cameras: up direction from the mounting of the cameras.
+        given: the capture's up direction.
+        hulls: points (N, 3) of the visual hull in some frames, metres.
+        one_person: whether the hulls show one person; the axis of several people is not vertical.
     """
-    cameras = infer_up(rig)
-    rough = up_vector(cameras.up)
-    axes = [axis for hull in hulls if (axis := _long_axis(hull)) is not None]
-    person = _mean_direction(axes, rough) if axes else None
-    up, how = rough, cameras.how
-    if person is not None and _degrees(person, rough) > _AGREE_DEG:
-        # cameras may be mounted sideways; a person who stands in most of the frames stands upright
-        if not cameras.level and len(axes) > len(hulls) / 2:
-            toward = up_vector(given)
-            up, how = (
-                person * (1.0 if person @ toward >= 0 else -1.0),
-                "along the standing person; the cameras are rolled",
-            )
-    elif person is not None:
-        # weighted by the variances; that of the person grows when the person leans or raises an arm
-        deviations = np.array([_degrees(a if a @ person >= 0 else -a, person) for a in axes])
-        variance = _LEANING_DEG**2 + float((deviations**2).mean()) / max(len(axes) / 2, 1)
-        other = (_LEVEL_DEG if cameras.level else _ROLLED_DEG) ** 2
-        up = rough if cameras.up in UP_AXES else _unit(rough / other + person / variance)
-        how = f"{cameras.how}; the axis of the person differs by {_degrees(person, rough):.0f}°"
+    axes = [axis for hull in hulls if one_person and (axis := _long_axis(hull)) is not None]
+    toward = up_vector(cameras.up if cameras.sure else given)
+    person = _mean_direction(axes, toward) if len(axes) > len(hulls) / 2 else None
+    up, how, decided = _decide(cameras, up_vector(given), person, axes)
     heights = [float(np.percentile(hull @ up, _FLOOR_PERCENTILE)) for hull in hulls if len(hull)]
     floor_m = float(np.median(heights)) if heights else float("nan")
-    return Leveling(up_text(np.round(up, 5)), how, floor_m, "" if person is None else up_text(np.round(person, 3)))
+    found = given if np.array_equal(up, up_vector(given)) else up_text(np.round(up, 5))
+    return Leveling(found, how, floor_m, "" if person is None else up_text(np.round(person, 3)), decided)
+
+
+def _decide(cameras: FoundUp, given: Float, person: Float | None, axes: Sequence[Float]) -> tuple[Float, str, bool]:
+    """Return the up direction (3,), how it was found, and whether the sources decide it.
+
+    Args:
+        cameras: up direction from the mounting of the cameras.
+        given: (3,) the capture's.
+        person: (3,) mean longest axis of the person; None if nobody stands. axes: (3,) of each frame.
+    """
+    rough = up_vector(cameras.up)
+    if person is None:
+        if cameras.sure and (cameras.level or _degrees(rough, given) <= _UNSURE_DEG):
+            return rough, cameras.how, True
+        why = f"{cameras.how}, and nobody stands alone in view"
+        return given, f"it cannot be decided: {why}", False
+    from_given = _degrees(person, given)
+    if not cameras.sure:
+        if from_given <= _AGREE_DEG:
+            axis = any(np.array_equal(given, up_vector(name)) for name in UP_AXES)
+            how = f"as the person stands, {from_given:.0f}° from the capture's; {cameras.how}"
+            return (given if axis and from_given <= _UNSURE_DEG else person), how, True
+        return given, f"it cannot be decided: the axis of the person differs by {from_given:.0f}°; {cameras.how}", False
+    apart = _degrees(person, rough)
+    if apart > _AGREE_DEG:
+        if _degrees(rough, given) <= _AGREE_DEG:
+            return rough, f"{cameras.how}; the axis of the person, who may lie or sit, differs by {apart:.0f}°", True
+        why = f"the cameras are mounted along {shown(cameras.up)}, the person along {shown(up_text(person.round(5)))}"
+        return given, f"it cannot be decided: {why}", False
+    # weighted by the variances; that of the person grows when the person leans or raises an arm
+    deviations = np.array([_degrees(a if a @ person >= 0 else -a, person) for a in axes])
+    variance = _LEANING_DEG**2 + float((deviations**2).mean()) / max(len(axes) / 2, 1)
+    other = (_LEVEL_DEG if cameras.level else _ROLLED_DEG) ** 2
+    up = rough if cameras.up in UP_AXES else _unit(rough / other + person / variance)
+    return up, f"{cameras.how}; the axis of the person differs by {apart:.0f}°", True
 
 
 def _long_axis(hull: Float) -> Float | None:
-    """Return the longest axis (3,) of points (N, 3), of either sign; None if it is not much longer than the others."""
+    """Return the longest axis (3,) of points (N, 3), of either sign; None if they are not as long and narrow as a
+    person who stands or lies."""
     if len(hull) < 50:
         return None
     values, vectors = np.linalg.eigh(np.cov(hull.T))
-    return np.asarray(vectors[:, 2]) if values[2] > _LONG**2 * values[1] else None
+    return np.asarray(vectors[:, 2]) if values[2] > _LONG**2 * values[1] and values[1] < _WIDE_M**2 else None
 
 
 def _mean_direction(axes: Sequence[Float], toward: Float) -> Float:
@@ -114,9 +143,11 @@ def write_up(capture: Path, leveling: Leveling) -> None:
     """Write ``up`` to `capture.toml` with a comment on how it was estimated; the rest of the file stays the same.
 
     Raises:
-        CaptureError: the file cannot be read or written, or is not TOML.
+        CaptureError: the estimate is not decided, or the file cannot be read or written, or is not TOML.
     """
     path = capture / "capture.toml"
+    if not leveling.decided:
+        raise CaptureError(f"{path}: up = {shown(leveling.up)} stays: {leveling.how}; write the right one yourself")
     text = read_text(path, CaptureError) if path.exists() else ""
     before = parse_toml(text, str(path))
     value = f'"{leveling.up}"' if leveling.up in UP_AXES else leveling.up

@@ -128,12 +128,17 @@ class Table:
         return float(value)
 
     def array(self, key: str, *shapes: tuple[int, ...]) -> NDArray[np.float64]:
-        """Return the numbers ``key``, each at most :data:`LARGE`, as an array of one of these shapes."""
+        """Return the numbers ``key``, each at most :data:`LARGE`, as an array of one of these shapes.
+
+        A row (1, N) or a column (N, 1), as OpenCV returns vectors, counts as a list (N,).
+        """
         if key not in self.values:
             self.fail(f"{key} is missing")
         value = self.values[key]
         wanted = " or ".join("×".join(map(str, shape)) or "1" for shape in shapes)
         shape = _shape(value)
+        if shape is not None and shape not in shapes and len(shape) == 2 and 1 in shape:
+            value, shape = list(_flat(value)), (max(shape),)
         if shape is None or shape not in shapes:
             found = "something else" if shape is None else "×".join(map(str, shape)) or "one number"
             self.fail(f"{key} must be {wanted} numbers, and is {found}")

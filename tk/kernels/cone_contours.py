@@ -116,7 +116,7 @@ def load_corner(outlines: ti.template(), c: int, i: int):
 def trace_curve(
     parts: ti.template(),  # (P, 20)
     placed: ti.template(),  # (B, P, 16)
-    cameras: ti.template(),  # (V, 22)
+    cameras: ti.template(),  # (V, 26)
     b: int,
     v: int,
     p: int,

@@ -134,7 +134,7 @@ def _contour_kernel(real):
         tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
         pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 20)
         strips: ti.types.ndarray(dtype=real, ndim=3),  # (S, N + 1, 5) η, ω, n_d; in the last row the piece
-        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (C, 22)
+        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (C, 26)
         spread: ti.i32,
         chosen: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, K)
         pose: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
@@ -235,7 +235,7 @@ class ContourKernel:
         angles: (S, N, 2) η and ω along each strip, radians; the last sample is the first.
         normals: (S, N, 3) n_d of eq. 2 there, in the piece's frame, 1/m.
         piece: (S,) the piece of each strip.
-        cameras: (C, 22) of :func:`tk.kernels.projection.pack_cameras`.
+        cameras: (C, 26) of :func:`tk.kernels.projection.pack_cameras`.
         dtype: np.float32, or np.float64 for checks.
     """
 

@@ -1,7 +1,8 @@
-"""Perspective projection with lens distortion and its derivative, as a Taichi function: OpenCV's two models.
+"""Perspective projection with lens distortion and its derivative, as a Taichi function: OpenCV's models, and skew.
 
-A camera is a row of 22 numbers: the 3×4 transform from world to camera (metres), fx, fy, cx, cy (pixels), five
-distortion coefficients, and 1 for the fisheye model or 0. Like OpenCV, skew is ignored.
+A camera is a row of 26 numbers: the 3×4 transform from world to camera (metres), fx, fy, cx, cy (pixels), five
+distortion coefficients, the model (0 Brown's with these five, 1 fisheye, 2 rational), skew (pixels), and the rational
+model's k4, k5, k6.
 """
 
 from collections.abc import Iterable
@@ -14,18 +15,21 @@ from tk.kernels.kinematics import rotation_of, translation_of
 from tk.kernels.runtime import ti
 from tk.kernels.vectors import product, times, transposed_times
 
-CAMERA_NUMBERS = 22
+CAMERA_NUMBERS = 26
 
 
 def pack_cameras(cameras: Iterable[Any]) -> NDArray[np.float64]:
-    """Pack cameras (:class:`tk.model.cameras.camera.Camera`) into one array (C, 22)."""
+    """Pack cameras (:class:`tk.model.cameras.camera.Camera`) into one array (C, 26)."""
     rows = []
     for c in cameras:
         row = np.zeros(CAMERA_NUMBERS)
         row[:12] = np.column_stack([c.rotation, c.translation]).ravel()
         row[12:16] = c.matrix[0, 0], c.matrix[1, 1], c.matrix[0, 2], c.matrix[1, 2]
-        row[16 : 16 + len(c.distortions)] = c.distortions
-        row[21] = float(c.fisheye)
+        row[16 : 16 + len(c.distortions[:5])] = c.distortions[:5]
+        row[21] = 1.0 if c.fisheye else 2.0 if len(c.distortions) == 8 else 0.0
+        row[22] = c.matrix[0, 1]
+        if len(c.distortions) == 8:
+            row[23:] = c.distortions[5:]
         rows.append(row)
     return np.array(rows)
 
@@ -49,9 +53,14 @@ def project(camera: ti.template(), v: int, x):
     # the distorted point and the symmetric derivative ((D00, D01), (D01, D11)) of the distortion
     xd, yd = a, b
     D00, D01, D11 = 1.0 + 0.0 * a, 0.0 * a, 1.0 + 0.0 * a
-    if camera[v, 21] == 0.0:
+    if camera[v, 21] != 1.0:
         radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
         slope = 2.0 * (k[0] + r2 * (2.0 * k[1] + 3.0 * r2 * k[4]))
+        if camera[v, 21] == 2.0:
+            k4, k5, k6 = camera[v, 23], camera[v, 24], camera[v, 25]
+            below = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+            radial = radial * below
+            slope = (slope - 2.0 * radial * (k4 + r2 * (2.0 * k5 + 3.0 * r2 * k6))) * below
         xd = a * radial + 2.0 * k[2] * a * b + k[3] * (r2 + 2.0 * a * a)
         yd = b * radial + k[2] * (r2 + 2.0 * b * b) + 2.0 * k[3] * a * b
         D00 = radial + a * a * slope + 2.0 * k[2] * b + 6.0 * k[3] * a
@@ -67,11 +76,12 @@ def project(camera: ti.template(), v: int, x):
         slope = (rate / (1.0 + r2) - scale) / r2
         xd, yd = a * scale, b * scale
         D00, D01, D11 = scale + a * a * slope, a * b * slope, scale + b * b * slope
-    fx, fy = camera[v, 12], camera[v, 13]
-    pixel = ti.Vector([fx * xd + camera[v, 14], fy * yd + camera[v, 15]])
+    fx, fy, skew = camera[v, 12], camera[v, 13], camera[v, 22]
+    pixel = ti.Vector([fx * xd + skew * yd + camera[v, 14], fy * yd + camera[v, 15]])
+    X0, X1 = fx * D00 + skew * D01, fx * D01 + skew * D11
     J = ti.Matrix(
         [
-            [fx * D00 * inverse, fx * D01 * inverse, -fx * (D00 * a + D01 * b) * inverse],
+            [X0 * inverse, X1 * inverse, -(X0 * a + X1 * b) * inverse],
             [fy * D01 * inverse, fy * D11 * inverse, -fy * (D01 * a + D11 * b) * inverse],
         ]
     )

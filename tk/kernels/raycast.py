@@ -46,7 +46,7 @@ FAR = 1e9
 class Rays(NamedTuple):
     """A grid of rays through the pixels of V images."""
 
-    cameras: NDArray[np.floating]  # (V, 22) of :func:`tk.kernels.projection.pack_cameras`
+    cameras: NDArray[np.floating]  # (V, 26) of :func:`tk.kernels.projection.pack_cameras`
     step: int  # pixels between rays; the first goes through pixel ``step // 2``
     directions: NDArray[np.float32]  # (V, H, W, 3) world frame; zero where a camera has no pixel
 
@@ -89,7 +89,7 @@ def _in_row(outline: ti.template(), b: int, v: int, p: int, y: int):
 @ti.func
 def middle_cost(
     placed_middle,
-    cameras: ti.template(),  # (V, 22)
+    cameras: ti.template(),  # (V, 26)
     cost: ti.template(),  # (V, H, W, G + 1)
     outline: ti.template(),  # (B, V, P, _COLUMNS)
     b: int,
@@ -117,7 +117,7 @@ def middle_cost(
 def enclose_part(
     parts: ti.template(),  # (P, 20)
     placed: ti.template(),  # (B, P, 12)
-    cameras: ti.template(),  # (V, 22)
+    cameras: ti.template(),  # (V, 26)
     b: int,
     p: int,
     outline: ti.template(),  # (B, V, P, _COLUMNS) out
@@ -226,7 +226,7 @@ def _cast_kernel(real):
         drawn: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (K,) the parts to draw
         chain: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,) the degrees of freedom that move them
         # the frame
-        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
+        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (V, 26)
         rays: ti.types.ndarray(dtype=ti.f32, ndim=4),  # (V, H, W, 3) world; zero outside the picture
         cost: ti.types.ndarray(dtype=ti.f32, ndim=4),  # (V, H, W, G + 1)
         before_label: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (V, H, W)

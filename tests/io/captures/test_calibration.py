@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -103,8 +104,12 @@ MATRIX = [[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]]
         ("matrix", MATRIX[:2], "3×3 numbers, and is 2×3"),
         ("matrix", [MATRIX[0], MATRIX[1], [0.0, 1.0]], "is something else"),
         ("matrix", "1 0 0", "is something else"),
-        ("distortions", [0.0] * 8, "4 or 5 numbers, and is 8"),
-        ("distortions", [], "4 or 5 numbers, and is 0"),
+        ("distortions", [0.0] * 7, "4 or 5 or 8 or 12 or 14 numbers, and is 7"),
+        ("distortions", [], "numbers, and is 0"),
+        ("distortions", [0.0] * 8 + [1e-3] + [0.0] * 3, "12 numbers, of a thin prism"),
+        ("matrix", [[60.0, 30.0, 31.5], *MATRIX[1:]], "a skew of 30 pixels"),
+        ("matrix", [[0.9, 0.0, 0.5], [0.0, 1.2, 0.5], MATRIX[2]], "focal lengths of 0.9 and 1.2 in an image of 64"),
+        ("matrix", [[9e4, 0.0, 0.5], [0.0, 9e4, 0.5], MATRIX[2]], "focal lengths of 9e+04 and 9e+04"),
         ("distortions", [0.0, float("inf"), 0.0, 0.0], "distortions holds inf"),
         ("rotation", np.eye(2).tolist(), "rotation must be 3 or 3×3 numbers, and is 2×2"),
         ("rotation", (2 * np.eye(3)).tolist(), "rotation is no rotation matrix: R Rᵀ is off the identity by 3"),
@@ -222,3 +227,71 @@ def test_a_written_calibration_differs_only_in_its_cameras(tmp_path: Path) -> No
     assert document["metadata"] == {"units": "mm"} and document["cameras"]["cam2"]["owner"] == "somebody"
     with pytest.raises(CalibrationError, match="cannot be written"):
         write_calibration(tmp_path / "none" / "new.toml", calibration, moved, [0.0, 0.0])
+
+
+def test_coefficients_that_are_zero_are_dropped(tmp_path: Path) -> None:
+    """OpenCV returns 8, 12 or 14 numbers when models are switched on; and vectors as rows or columns."""
+    tables = calibration_tables(5)
+    expected = read_calibration(write(tmp_path, tables)).rig
+    brown = [-0.1, 0.02, 1e-3, 2e-3, 0.01]
+    rational = [*brown, 0.3, 0.02, 0.0]
+    given = (brown, [*brown, 0.0, 0.0, 0.0], rational, [*rational, *[0.0] * 4], [rational])
+    for table, values in zip(tables.values(), given, strict=True):
+        table["distortions"] = values
+        table["rotation"] = [[x] for x in table["rotation"]]
+        table["translation"] = [table["translation"]]
+    found = read_calibration(write(tmp_path, tables)).rig
+    for camera, other, values in zip(found, expected, (brown, brown, rational, rational, rational), strict=True):
+        np.testing.assert_array_equal(camera.distortions, values)
+        np.testing.assert_array_equal(camera.rotation, other.rotation)
+        np.testing.assert_array_equal(camera.translation, other.translation)
+
+
+def test_skew_is_kept(tmp_path: Path) -> None:
+    tables = calibration_tables(2)
+    tables["cam1"]["matrix"][0][1] = 3.0
+    assert read_calibration(write(tmp_path, tables)).rig[0].matrix[0, 1] == 3.0
+
+
+@pytest.mark.parametrize(
+    ("rotation", "translation", "cameras", "complaint"),
+    [
+        ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 4, "all 4 cameras have the same rotation and translation (zero)"),
+        ([0.1, 2.0, 0.3], [0.0, 1.0, 3.0], 4, "all 4 cameras have the same rotation and translation;"),
+        (None, [0.0, 0.0, 0.0], 4, "all 4 cameras stand in the same place"),
+        ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 2, "the cameras cam1, cam2 have a rotation and translation of zero"),
+    ],
+)
+def test_cameras_without_a_pose_are_refused(
+    tmp_path: Path, rotation: list[float] | None, translation: list[float], cameras: int, complaint: str
+) -> None:
+    tables = calibration_tables(4)
+    for k in range(cameras):
+        tables[f"cam{k + 1}"]["translation"] = translation
+        if rotation is not None:
+            tables[f"cam{k + 1}"]["rotation"] = rotation
+    path = write(tmp_path, tables)
+    with pytest.raises(CalibrationError, match=re.escape(f"{path}: {complaint}")):
+        read_calibration(path)
+
+
+def test_one_camera_may_be_the_world(tmp_path: Path) -> None:
+    tables = calibration_tables(3)
+    tables["cam1"] |= {"rotation": [0.0, 0.0, 0.0], "translation": [0.0, 0.0, 0.0]}
+    assert len(read_calibration(write(tmp_path, tables)).rig) == 3
+
+
+def test_all_cameras_vote_for_up_also_those_that_are_not_selected(tmp_path: Path) -> None:
+    tables = calibration_tables(5)
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # a world with -y up
+    for k, table in enumerate(tables.values()):
+        roll = quarter if k < 2 else np.eye(3)
+        table["rotation"] = (roll @ cv2.Rodrigues(np.array(table["rotation"]))[0] @ turn.T).tolist()
+        table["translation"] = (roll @ table["translation"]).tolist()
+    calibration = read_calibration(write(tmp_path, tables))
+    assert calibration.mounting.up == calibration.select(["cam1", "cam2"]).mounting.up == "-y"
+    for table in list(tables.values())[:2]:
+        table["rotation_count"] = -1
+    found = read_calibration(write(tmp_path, {k: tables[k] for k in ("cam1", "cam2")}))
+    assert found.mounting.up == "-y" and found.turns == (3, 3)

@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -345,10 +346,38 @@ def test_millimetres_without_units_are_recognised(make_capture: MakeCapture) -> 
 def test_a_volume_that_cannot_be_inferred_is_reported(make_capture: MakeCapture) -> None:
     folder = make_capture(cameras=2, settings={})
     tables = calibration_tables(2)
-    tables["cam2"] |= {key: tables["cam1"][key] for key in ("rotation", "translation")}
+    tables["cam2"] |= {"rotation": tables["cam1"]["rotation"], "translation": [0.5, 0.5, 3.0]}
     write_toml(folder / "calibration.toml", tables)
     with refused(VolumeError, str(folder / "capture.toml"), "parallel", "add one"):
         open_capture(folder)
+
+
+@pytest.mark.parametrize("settings", [{}, {"volume": {"center": [0.0, 0.0, 1.0], "size": [2.0, 2.0, 2.0]}}])
+def test_cameras_in_the_axes_of_opengl_are_refused(make_capture: MakeCapture, settings: dict[str, Any]) -> None:
+    folder = make_capture(cameras=4, settings=settings)
+    tables = calibration_tables(4)
+    flip = np.diag([1.0, -1.0, -1.0])
+    for table in tables.values():
+        table["rotation"] = (flip @ cv2.Rodrigues(np.array(table["rotation"]))[0]).tolist()
+        table["translation"] = (flip @ table["translation"]).tolist()
+    write_toml(folder / "calibration.toml", tables)
+    with refused(CalibrationError, folder / "calibration.toml", "all 4 cameras look away", "OpenGL"):
+        open_capture(folder)
+
+
+def test_cameras_on_their_side_leave_the_default_up(make_capture: MakeCapture) -> None:
+    folder = make_capture(cameras=5, settings={})
+    tables = calibration_tables(5)
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    for table in tables.values():
+        table["rotation"] = (quarter @ cv2.Rodrigues(np.array(table["rotation"]))[0]).tolist()
+        table["translation"] = (quarter @ table["translation"]).tolist()
+    write_toml(folder / "calibration.toml", tables)
+    capture = open_capture(folder)
+    assert capture.up == "z"
+    assert any(
+        "gives no up, and the cameras are mounted differently: z is a guess" in line for line in capture.warnings
+    )
 
 
 # -------------------------------------------------------------------------------------------------- shared captures

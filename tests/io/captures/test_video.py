@@ -205,12 +205,6 @@ def test_a_damaged_video_is_reported_at_the_same_image_if_it_is_reduced(tmp_path
     assert said[0] == said[1]
 
 
-def test_a_mask_of_zeros_and_ones_is_refused(tmp_path: Path) -> None:
-    write_picture(tmp_path / "cam" / "000000.png", np.eye(8, dtype=np.uint8))
-    with closing(probe(tmp_path / "cam", is_mask=True).open()) as reader, pytest.raises(VideoError, match="255"):
-        reader.read(np.zeros((8, 8), np.uint8))
-
-
 def test_an_image_of_another_size_is_refused(tmp_path: Path) -> None:
     write_picture(tmp_path / "cam" / "0.png", picture(0, 0))
     write_picture(tmp_path / "cam" / "1.png", picture(0, 1, (32, 32)))

@@ -89,6 +89,29 @@ def test_pose2sim_with_the_file_of_qualisys(folder: Path, check: Import) -> None
     assert "# imported from Pose2Sim" in (check(folder, rig).imported.path / "capture.toml").read_text()
 
 
+def test_size_with_fractions_is_replaced_by_the_videos(folder: Path, check: Import) -> None:
+    """Pose2Sim's conversions double the principal point, which may be 30 pixels off the middle."""
+    rig = make_rig()
+    document = tables(renamed(rig, "1", "2", "3", "4"))
+    for k, table in enumerate(document.values()):
+        table["size"] = [WIDTH - 30.5 + k, HEIGHT + 4.25]
+    (folder / "calibration").mkdir()
+    write_toml(folder / "calibration" / "Calib.toml", document)
+    write_clips(folder / "videos", ["1", "2", "3", "4"])
+    note = check(folder, rig).note("camera '2'", "is not an image's")
+    assert note.endswith(f"290.5×244.2, is not an image's; the video's is used, {WIDTH}×{HEIGHT}")
+
+
+def test_freemocap_2_keeps_videos_in_a_folder(folder: Path, check: Import) -> None:
+    rig = renamed(make_rig(), "0", "1", "2", "3")
+    name = "2026-08-11_19-05-16_GMT-5_mocap"
+    (folder / name).mkdir()
+    write_toml(folder / name / f"{name}_camera_calibration.toml", tables(rig, unit_m=0.001))
+    for kind, end in (("synchronized", ""), ("annotated", "_annotated")):
+        write_clips(folder / name / "videos" / kind, [f"{name}.camera{k}{end}" for k in range(4)])
+    check(folder / name, rig)
+
+
 def test_freemocap_without_a_board_on_the_floor(folder: Path, check: Import) -> None:
     """The world is camera 0's frame and lengths are millimetres, which the file does not say."""
     rig = make_rig()
@@ -158,6 +181,7 @@ def test_caliscope_new_layout(folder: Path, check: Import) -> None:
     cameras = {
         str(index): {
             "cam_id": index,
+            "rotation_count": -(index % 3),
             "size": [WIDTH, HEIGHT],
             "matrix": camera.matrix.tolist(),
             "distortions": camera.distortions.tolist(),
@@ -169,7 +193,9 @@ def test_caliscope_new_layout(folder: Path, check: Import) -> None:
     write_toml(folder / "camera_array.toml", {"cameras": cameras})
     for take in ("first", "second"):
         write_clips(folder / "recordings" / take, [f"cam_{k}" for k in range(4)])
-    assert check(folder, rig, trial="second").capture.rig.names == ("0", "1", "2", "3")
+    capture = check(folder, rig, trial="second").capture
+    assert capture.rig.names == ("0", "1", "2", "3")
+    assert capture.calibration.turns == (0, 3, 2, 0)  # kept, clockwise
 
 
 @pytest.mark.parametrize("metadata", [{}, {"units": "mm"}])

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from tests.io.conftest import CENTER, look_at
 from tests.io.importers.conftest import make_rig, points
 from tk.io.importers.write import find_volume
 from tk.model.cameras.camera import Rig
@@ -63,12 +64,65 @@ def test_parallel_cameras_use_the_mean_direction() -> None:
     assert "the mean" in found.how
 
 
-def test_inconsistent_mounting_is_noted() -> None:
-    rig = make_rig()
-    half = Rotation.from_euler("z", 180, degrees=True).as_matrix()
-    two = [replace(c, rotation=half @ c.rotation, translation=half @ c.translation) for c in rig.cameras[:2]]
-    assert "check it" in infer_up(Rig((*two, *rig.cameras[2:]))).how
-    assert "z is a guess" in infer_up(Rig((rig[0], replace(two[0], name="upside down")))).how
+def spun(rig: Rig, degrees: float, cameras: slice = slice(None)) -> Rig:
+    """Return the rig with some cameras rotated about their optical axes, clockwise as seen from behind."""
+    roll = Rotation.from_euler("z", -degrees, degrees=True).as_matrix()
+    chosen = rig.cameras[cameras]
+    return Rig(
+        tuple(
+            replace(c, rotation=roll @ c.rotation, translation=roll @ c.translation) if c in chosen else c for c in rig
+        )
+    )
+
+
+def arc_rig(world: np.ndarray, half_deg: float, down_deg: float, count: int = 4) -> Rig:
+    """Return upright cameras on one side of a room that look at a person, some more downwards than others."""
+    cameras = []
+    for index, heading in enumerate(np.linspace(-half_deg, half_deg, count)):
+        down = down_deg + 4.0 * (index % 2)
+        upright = Rotation.from_euler("ZX", [heading, -90.0 - down], degrees=True).as_matrix().T
+        rotation = upright @ world.T
+        cameras.append(replace(make_rig()[0], name=str(index), rotation=rotation, translation=np.array([0, 0, 3.0])))
+    return Rig(tuple(cameras))
+
+
+@pytest.mark.parametrize("half_deg", [20.0, 45.0, 80.0])
+@pytest.mark.parametrize("down_deg", [0.0, 20.0, 40.0])
+@pytest.mark.parametrize("spin", [90.0, -90.0])
+def test_cameras_on_their_side_do_not_decide(half_deg: float, down_deg: float, spin: float) -> None:
+    """In an arc they agree on a direction, but in a world with this direction they would be stacked."""
+    upright = arc_rig(np.eye(3), half_deg, down_deg)
+    assert infer_up(upright).up == "z" and infer_up(upright).sure
+    found = infer_up(spun(upright, spin))
+    assert found.up == "z" and not found.sure and "z is a guess" in found.how
+    assert infer_up(spun(upright, spin), [int(spin / 90)] * 4) == infer_up(upright)
+
+
+def test_cameras_on_their_side_all_around_do_not_decide() -> None:
+    turn = Rotation.random(random_state=3).as_matrix()
+    for count in range(2, 9):
+        angles = 2 * np.pi * np.arange(count) / count
+        rig = Rig(
+            tuple(
+                replace(make_rig()[0], name=str(k), rotation=look_at(c, CENTER)[0] @ turn.T)
+                for k, c in enumerate(CENTER + 3 * np.stack([np.cos(angles), np.sin(angles), 0.2 + 0 * angles], 1))
+            )
+        )
+        assert infer_up(rig).sure and not infer_up(spun(rig, 90)).sure
+
+
+def test_majority_of_the_cameras_decides() -> None:
+    turn = Rotation.from_euler("xyz", [0.5, -0.4, 0.2]).as_matrix()
+    rig = Rig((*make_rig(world=turn), replace(make_rig(world=turn)[1], name="fifth")))
+    for degrees in (90, 180, -90):
+        found = infer_up(spun(rig, degrees, slice(2)))
+        assert found.sure
+        np.testing.assert_allclose(up_vector(found.up), turn[:, 2], atol=1e-6)
+        assert not infer_up(spun(rig, degrees, slice(3))).sure or degrees == 180
+    two = spun(Rig(rig.cameras[:4]), 180, slice(2))
+    assert infer_up(two).how == "the cameras are mounted differently: z is a guess"
+    # unless it is known how the images are turned
+    np.testing.assert_allclose(up_vector(infer_up(two, [2, 2, 0, 0]).up), turn[:, 2], atol=1e-6)
 
 
 def test_volume_contains_the_person() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from tk.errors import VideoError
 from tk.io.captures.capture import open_capture
 from tk.io.importers import import_project
 from tk.model.cameras.camera import Camera, Rig
+from tk.model.cameras.up import up_text
 
 SERIALS = ["26578", "26579", "26580", "26581"]
 
@@ -75,6 +78,62 @@ def test_qualisys_marker_cameras_record_no_videos(folder: Path, check: Import) -
     write_clips(folder, [SERIALS[0], SERIALS[2], SERIALS[3]])
     checked = check(folder, Rig((rig[0], rig[2], rig[3])))
     checked.note("1 of its 4 cameras record no videos: left out")
+
+
+@pytest.mark.parametrize("model", ["Miqus Hybrid", "Oqus 210c"])
+def test_qualisys_camera_with_a_video_is_a_video_camera(folder: Path, check: Import, model: str) -> None:
+    rig = renamed(make_rig(), *SERIALS)
+    write_qca(folder / "session.qca.txt", rig, ("Miqus Video", model, "Miqus Video", model))
+    write_clips(folder, [f"trial01_Miqus_{serial}" for serial in SERIALS])
+    notes = check(folder, rig).imported.notes
+    assert not any("left out" in note for note in notes)
+
+
+def test_marker_cameras_vote_for_up_and_need_no_calibration(folder: Path, check: Import) -> None:
+    """The video cameras hang on their side; two of the marker cameras are not calibrated."""
+    quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    turn = Rotation.from_euler("x", -90, degrees=True).as_matrix()
+    upright = make_rig(world=turn)
+    video = [replace(c, rotation=quarter @ c.rotation, translation=quarter @ c.translation) for c in upright]
+    markers = [*upright, *upright.cameras[:3]]
+    rig = renamed(Rig((*video, *markers)), *SERIALS, *(f"9{k}" for k in range(len(markers))))
+    path = folder / "session.qca.txt"
+    write_qca(path, rig, ("Miqus Video",) * 4 + ("Miqus M3",) * len(markers))
+    before, first, rest = path.read_text().partition('serial="90"')
+    path.write_text(before + first + rest.replace('r11="', 'r11="7', 1).replace("focalLengthU", "U", 1))
+    write_clips(folder, SERIALS)
+    imported = import_project(folder, check.output)
+    assert open_capture(check.output).up == up_text(turn[:, 2].round(9))
+    assert any("7 of its 11 cameras record no videos: left out" in note for note in imported.notes)
+
+
+@pytest.mark.parametrize("unit", [64.0, 1.0])
+@pytest.mark.parametrize("name", ["session.qca.txt", "cal.txt"])
+def test_qualisys_without_fov_video_shows_the_whole_sensor(folder: Path, check: Import, unit: float, name: str) -> None:
+    """Theia writes such files, in pixels."""
+    rig = renamed(make_rig(), *SERIALS)
+    path = folder / name
+    write_qca(path, rig)
+    text = re.sub(r"<fov_video .*/>", "", path.read_text())
+    extent = f'sensorMinU="0" sensorMinV="0" sensorMaxU="{unit * WIDTH - 1}" sensorMaxV="{unit * HEIGHT - 1}" '
+
+    def scaled(found: re.Match[str]) -> str:
+        shift = {"centerPointU": LEFT, "centerPointV": TOP}.get(found[1], 0)
+        return f'{found[1]}="{(float(found[2]) / 64 - shift) * unit!r}"'
+
+    text = re.sub(r'(focalLength[UV]|centerPoint[UV])="([^"]*)"', scaled, text)
+    path.write_text(text.replace("<intrinsic ", f"<intrinsic {extent}"))
+    write_clips(folder, SERIALS)
+    check(folder, rig).note("has no fov_video: the videos are taken to show the whole sensor")
+
+
+def test_vicon_camera_with_a_video_is_a_video_camera(folder: Path, check: Import) -> None:
+    rig = renamed(make_rig(distorted=False), *SERIALS)
+    path = folder / "session.xcp"
+    write_xcp(path, rig)
+    path.write_text(path.read_text().replace('TYPE="Vicon.VideoCamera" DISPLAY_TYPE="Vue"', 'TYPE="Vero"', 2))
+    write_clips(folder, [f"Walk01.{serial}" for serial in SERIALS], suffix=".avi")
+    check(folder, rig)
 
 
 def test_vicon(folder: Path, check: Import) -> None:

@@ -238,7 +238,7 @@ def test_cameras_can_be_replaced_and_are_kept_by_a_resumed_run(path: Path) -> No
     assert_same_cameras(read_result(path).cameras, make_cameras(shift_m=0.5))
     with h5py.File(path) as file:
         assert list(file["cameras"].attrs["names"]) == ["cam1", "cam2"]
-        assert file["cameras/rotation"].shape == (2, 3) and file["cameras/distortions"].shape == (2, 5)
+        assert file["cameras/rotation"].shape == (2, 3) and file["cameras/distortions"].shape == (2, 8)
 
 
 # --- joints -----------------------------------------------------------------------------------------------------------

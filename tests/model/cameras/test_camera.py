@@ -21,12 +21,13 @@ def camera(
     rotation: tuple[float, float, float] = (1.6, 0.3, -0.2),
     translation: tuple[float, float, float] = (0.1, 0.9, 3.5),
     fisheye: bool = False,
+    skew: float = 0.0,
 ) -> Camera:
     return Camera(
         name="cam",
         width=640,
         height=480,
-        matrix=MATRIX,
+        matrix=MATRIX + skew * np.eye(3, k=1) * [0, 1, 0],
         distortions=np.array(distortions),
         rotation=cv2.Rodrigues(np.array(rotation))[0],
         translation=np.array(translation),
@@ -40,6 +41,10 @@ LENSES = {
     "pincushion": camera((0.08, 0.02, -0.001, 0.001)),
     "third order": camera((-0.2, 0.05, 0.0, 0.0, -0.02)),
     "fisheye": camera((0.05, -0.01, 0.002, -0.001), fisheye=True),
+    # of an Azure Kinect: two polynomials that nearly cancel
+    "rational": camera((0.5, -2.6, 0.0006, -0.0004, 1.5, 0.45, -2.45, 1.42)),
+    "skew": camera((-0.3, 0.1, 0.001, -0.002, 0.0), skew=30.0),
+    "fisheye, skew": camera((0.05, -0.01, 0.002, -0.001), fisheye=True, skew=-12.0),
 }
 
 pixels = st.tuples(st.floats(0, 639), st.floats(0, 479))
@@ -60,14 +65,14 @@ def by_hand(cam: Camera, p_world: np.ndarray) -> np.ndarray:
         a, b = a * scale, b * scale
     else:
         k1, k2, p1, p2, *rest = cam.distortions
-        k3 = rest[0] if rest else 0.0
+        k3, k4, k5, k6 = (*rest, 0.0, 0.0, 0.0, 0.0)[:4]
         r2 = a * a + b * b
-        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
         a, b = (
             a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a),
             b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b,
         )
-    return np.array([MATRIX[0, 0] * a + MATRIX[0, 2], MATRIX[1, 1] * b + MATRIX[1, 2]])
+    return np.array([MATRIX[0, 0] * a + cam.matrix[0, 1] * b + MATRIX[0, 2], MATRIX[1, 1] * b + MATRIX[1, 2]])
 
 
 @pytest.mark.parametrize("lens", LENSES)
@@ -121,6 +126,10 @@ def test_points_behind_the_camera_are_not_visible(lens: str) -> None:
         (camera((-0.3, 0.0, 0.0, 0.0)), np.arctan(np.sqrt(1 / 0.9))),
         # θ (1 - 0.3 θ²) turns back at θ = 1.054
         (camera((-0.3, 0.0, 0.0, 0.0), fisheye=True), np.sqrt(1 / 0.9)),
+        # r / (1 + r²) turns back at r = 1 = tan 45°
+        (camera((0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0)), np.pi / 4),
+        # r / (1 - r²) has a pole at r = 1
+        (camera((0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0)), np.pi / 4),
     ],
 )
 def test_points_beyond_the_fold_of_the_distortion_are_not_visible(cam: Camera, fold: float) -> None:

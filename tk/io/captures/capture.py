@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import CaptureError, VideoError, VolumeError
+from tk.errors import CalibrationError, CaptureError, VideoError, VolumeError
 from tk.io.captures.calibration import Calibration, match_camera, read_calibration
 from tk.io.captures.capture_toml import CaptureSettings, GivenSubject, read_settings
 from tk.io.captures.clip import Clip, Image
@@ -27,9 +27,9 @@ from tk.io.captures.timing import resample as resampled
 from tk.io.captures.video import VideoClip, as_calibrated, damaged_images, notes_on, odd_turn
 from tk.io.paths import text_of
 from tk.model.cameras.camera import Camera, Rig
-from tk.model.cameras.common_view import infer_volume, sample_box, views_of
-from tk.model.cameras.mounting import infer_up
-from tk.model.cameras.up import shown_up, up_vector
+from tk.model.cameras.common_view import all_look_away, infer_volume, sample_box, views_of
+from tk.model.cameras.mounting import DEFAULT_UP, FoundUp
+from tk.model.cameras.up import shown, up_vector
 from tk.model.cameras.volume import Volume
 from tk.model.masks.image_health import described
 from tk.model.setup import Setup, Subject
@@ -55,8 +55,8 @@ _BACKGROUND_PIXELS, _BACKGROUND_BYTES = 50_000_000, 400_000_000
 #: most images of a video that are checked for damage after a camera has disagreed: about a millisecond each
 _CHECKED_IMAGES = 3000
 
-#: axis that points up if `capture.toml` gives none, unless the cameras' mounting differs by more than _UP_DEG degrees
-DEFAULT_UP, _UP_DEG = "z", 25.0
+#: if `capture.toml` gives no up direction, the default counts unless the cameras' mounting differs by more, degrees
+_UP_DEG = 25.0
 
 #: metres; a note asks for the unit if cameras are farther apart, because their positions may be in millimetres
 _FAR_APART_M = 100.0
@@ -121,7 +121,7 @@ class Capture:
             f"{len(self.rig)} cameras: {cameras}\n"
             f"{count} frames, {self.first_frame} to {self.frame_count - 1}, {count / self.fps:.1f} s at "
             f"{self.fps:g} frames/s\n"
-            f"masks: {masks}; up: {shown_up(self.up)}"
+            f"masks: {masks}; up: {shown(self.up)}"
         )
 
     @property
@@ -307,7 +307,7 @@ def open_capture(
         path=path,
         name=settings.name or text_of(path.resolve().name),
         fps=fps,
-        up=_up(settings, rig, path, warnings.append),
+        up=_up(settings, calibration.mounting, path, warnings.append),
         rig=rig,
         volume=_working_volume(settings, rig, path, warnings.append),
         frame_count=frame_count,
@@ -405,14 +405,16 @@ def _common_length(clips: Sequence[Clip], late: Sequence[int], warn: Callable[[s
     return common
 
 
-def _up(settings: CaptureSettings, rig: Rig, path: Path, warn: Callable[[str], None]) -> str:
-    """Return the axis of `capture.toml`; if it gives none, z, unless the cameras' mounting indicates another one."""
+def _up(settings: CaptureSettings, found: FoundUp, path: Path, warn: Callable[[str], None]) -> str:
+    """Return the axis of `capture.toml`; if it gives none, z, unless most cameras are mounted along another one."""
     if settings.up is not None:
         return settings.up
-    found = infer_up(rig)
+    if not found.sure:
+        warn(f'{path / "capture.toml"}: gives no up, and {found.how}; write up = "{found.up}" if it is right')
+        return found.up
     if up_vector(found.up) @ up_vector(DEFAULT_UP) > np.cos(np.radians(_UP_DEG)):
         return DEFAULT_UP
-    warn(f"{path / 'capture.toml'}: gives no up; {shown_up(found.up)} is taken, {found.how}; tk level looks closer")
+    warn(f"{path / 'capture.toml'}: gives no up; {shown(found.up)} is taken, {found.how}; tk level looks closer")
     return found.up
 
 
@@ -423,11 +425,15 @@ def _working_volume(settings: CaptureSettings, rig: Rig, path: Path, warn: Calla
         try:
             volume = infer_volume(rig)
         except VolumeError as reason:
+            if away := all_look_away(rig):
+                raise CalibrationError(f"{path / 'calibration.toml'}: {away}") from None
             raise VolumeError(f"{file}: gives no [volume], and none can be inferred: {reason}; add one") from None
         center, size = ([round(x, 2) for x in values] for values in (volume.center, volume.size))
         warn(f"{file}: gives no [volume]; inferred from the cameras: center = {center}, size = {size} (metres)")
         return volume
     if not (views_of(rig, sample_box(settings.volume)) >= 2).any():
+        if away := all_look_away(rig):
+            raise CalibrationError(f"{path / 'calibration.toml'}: {away}")
         raise VolumeError(
             f"{file}: [volume]: no two cameras see center = {list(settings.volume.center)}, "
             f"size = {list(settings.volume.size)}; move it (metres), or check the units in calibration.toml"

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import VideoError
+from tk.io.captures.mask_forms import MaskForm
 from tk.kernels.mask_values import PERSON
 
 # OpenCV and FFmpeg write nothing to the terminal, unless the user sets these variables: errors here name the file.
@@ -52,6 +53,7 @@ class Clip(ABC):
     # (N,) times of the images, seconds, increasing; None if the clip gives none
     times_s: NDArray[np.float64] | None = field(default=None, compare=False)
     recorded_size: tuple[int, int] | None = None  # width and height in the files, if the clip is reduced
+    mask_form: MaskForm = field(default_factory=MaskForm, compare=False, repr=False)  # of a clip of masks
 
     @abstractmethod
     def open(self) -> Reader:
@@ -80,7 +82,7 @@ def deliver(clip: Clip, picture: NDArray[Any], path: Path, out: Image) -> None:
     height, width = picture.shape[:2]
     check_size(clip, width, height, path)
     if clip.is_mask:
-        picture = _binarised(picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
+        picture = clip.mask_form.convert(picture, path)
     if clip.recorded_size:
         factor = width // clip.width
         whole = picture[: factor * clip.height, : factor * clip.width]

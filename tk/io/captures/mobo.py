@@ -28,6 +28,7 @@ from tk.io.captures.calibration import Calibration
 from tk.io.captures.capture_toml import CaptureSettings
 from tk.io.paths import c_name
 from tk.model.cameras.camera import Camera, Rig
+from tk.model.cameras.mounting import infer_up
 
 #: the walks begin in any pose
 SETTINGS = CaptureSettings(fps=30.0, up="z", init_pose="any")
@@ -86,7 +87,7 @@ def read_cameras(walk: MoboWalk) -> Calibration:
             "vr03_7.cal and so on beside them, or write a calibration.toml"
         )
     cameras = tuple(_read_camera(name, file, _picture_size(walk.path / name)) for name, file in walk.files.items())
-    return Calibration(walk.path, Rig(cameras), tuple(walk.files))
+    return Calibration(walk.path, Rig(cameras), tuple(walk.files), mounting=infer_up(Rig(cameras)))
 
 
 def _read_camera(name: str, file: Path, size: tuple[int, int]) -> Camera:

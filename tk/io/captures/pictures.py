@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tk.errors import VideoError
 from tk.io.captures.clip import Clip, Image, Reader, deliver
+from tk.io.captures.mask_forms import without_palette
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pbm", ".pgm", ".ppm")
 
@@ -61,8 +62,6 @@ class _PictureReader:
         path = clip.files[self._index]
         picture = _read_picture(path, clip.is_mask)
         self._index += 1
-        if clip.is_mask and picture.max(initial=0) == 1:
-            raise VideoError(f"{path}: holds the values 0 and 1; a mask's person is white, 255")
         deliver(clip, picture, path, out)
 
     def close(self) -> None:
@@ -99,11 +98,11 @@ def _read_picture(path: Path, is_mask: bool) -> NDArray[Any]:
     coded = path.read_bytes()
     picture = None
     if _has_end(coded):
-        flags = cv2.IMREAD_GRAYSCALE if is_mask else cv2.IMREAD_COLOR
+        flags = cv2.IMREAD_UNCHANGED if is_mask else cv2.IMREAD_COLOR
         picture = cv2.imdecode(np.frombuffer(coded, np.uint8), flags)
     if picture is None:
         raise VideoError(f"{path}: is not a picture that can be decoded, or is cut off")
-    return picture
+    return without_palette(picture, coded) if is_mask else picture
 
 
 def _has_end(coded: bytes) -> bool:

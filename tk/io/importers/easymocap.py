@@ -1,7 +1,7 @@
 """EasyMocap: `intri.yml` and `extri.yml`, YAML as OpenCV writes it.
 
     names: ["1", "2"]
-    K_1, dist_1                intrinsic matrix; k1 k2 p1 p2 k3
+    K_1, dist_1                intrinsic matrix; k1 k2 p1 p2 k3 [k4 k5 k6]
     H_1, W_1                   rows and columns; if missing, the videos' size is used
     R_1 or Rot_1, T_1          Rodrigues vector or matrix, world to camera; metres
 
@@ -33,7 +33,7 @@ def _read(files: Sequence[Path]) -> Tables:
         if rotation is None or translation is None:
             found.leave_out(name, f"has no R_{name} and T_{name} in {extrinsic.path.name}")
             continue
-        K, distortions = intrinsic.matrix(f"K_{name}", 9), intrinsic.matrix(f"dist_{name}", 5, 4)
+        K, distortions = intrinsic.matrix(f"K_{name}", 9), intrinsic.matrix(f"dist_{name}", 5, 4, 8)
         if K is None:
             raise CalibrationError(f"{intrinsic.path}: has no K_{name}, the matrix of camera {name!r}")
         found.add(

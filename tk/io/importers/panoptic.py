@@ -38,7 +38,7 @@ def _read(files: Sequence[Path]) -> Tables:
             key=f"{item.get('type', '')}_{name}",
             size=table.array("resolution", (2,)),
             matrix=table.array("K", (3, 3)),
-            distortions=table.array("distCoef", (5,), (4,)),
+            distortions=table.array("distCoef", (5,), (4,), (8,)),
             rotation=table.array("R", (3, 3)),
             translation=np.ravel(table.array("t", (3, 1), (3,), (1, 3))),
         )

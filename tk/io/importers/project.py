@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,10 @@ from tk.errors import CalibrationError, VideoError, VolumeError
 from tk.io.captures.calibration import calibration_of, scale_world
 from tk.io.captures.units import LEAST_APART_M, MOST_APART_M, UNITS, FoundUnit, apart, infer_unit
 from tk.io.importers.files import matching
-from tk.io.importers.videos import CameraNames, find_clips
+from tk.io.importers.videos import CameraNames, Found, find_clips
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import view_height
+from tk.model.cameras.mounting import FoundUp
 
 #: metres, least height of the views in which a person fits: a child of one metre, and a margin
 PERSON_VIEW_M = 1.2
@@ -30,10 +32,13 @@ class Project:
     source: Path  # calibration file or folder
     rig: Rig  # cameras with a video, metres. A width and height of 0 are unknown: the video's size is used.
     clips: tuple[Path, ...]  # video file or folder of images of each camera
+    up: FoundUp  # the world's up direction
     # masks, backgrounds: the same for masks and images of the empty scene; empty without any
     masks: tuple[Path, ...] = ()
     backgrounds: tuple[Path, ...] = ()
-    up: str | None = None  # the world's up direction if the format fixes it ("-y"), else None
+    turns: tuple[int, ...] = ()  # clockwise quarter turns after which each camera's image is upright; empty: none
+    # width and height of each camera as the file has them, if they are no whole numbers, else None; empty: all None
+    fractional: tuple[tuple[float, float] | None, ...] = ()
     notes: tuple[str, ...] = ()  # lines for the user about what was inferred or left out
 
 
@@ -44,6 +49,7 @@ class Tables:
         source: calibration file or folder.
         cameras: table of each camera, lengths in the file's unit, by a second name of the camera, which its video may
             have.
+        markers: cameras that may record no videos. unusable: number of such cameras that are not calibrated.
         notes: as in :class:`Project`.
         unit: unit of lengths, None if unknown; unit_from: what specifies it.
     """
@@ -51,6 +57,8 @@ class Tables:
     def __init__(self, source: Path, unit: str | None = None, unit_from: str = "the file") -> None:
         self.source, self.unit, self.unit_from = source, unit, unit_from
         self.cameras: dict[str, Mapping[str, Any]] = {}
+        self.markers: set[str] = set()
+        self.unusable = 0
         self.notes: list[str] = []
 
     def add(
@@ -62,6 +70,7 @@ class Tables:
         rotation: ArrayLike,
         translation: ArrayLike,
         key: str = "",
+        turns: int = 0,
     ) -> None:
         """Add a camera.
 
@@ -69,15 +78,36 @@ class Tables:
             name: its name.
             size: width and height, pixels; 0 and 0 are unknown: the video's size is used.
             matrix: (3, 3) intrinsic matrix, pixels.
-            distortions: (4,) or (5,) in OpenCV's order.
+            distortions: (4,), (5,) or (8,) in OpenCV's order.
             rotation: (3,) Rodrigues vector or (3, 3), world to camera.
             translation: (3,) world to camera.
             key: its second name.
+            turns: clockwise quarter turns after which its image is upright.
         """
         arrays = {"size": size, "matrix": matrix, "distortions": distortions}
         arrays |= {"rotation": rotation, "translation": translation}
         values = {name: np.asarray(array).tolist() for name, array in arrays.items()}
-        self.cameras[key if key and key not in self.cameras else name] = {"name": name, **values}
+        table = {"name": name, "rotation_count": turns, **values}
+        self.cameras[key if key and key not in self.cameras else name] = table
+
+    @contextmanager
+    def optional(self, name: str, marker: bool) -> Iterator[None]:
+        """Read a camera in the block. If it is a marker camera, a fault of its calibration leaves it out in silence."""
+        before, notes = set(self.cameras), len(self.notes)
+        try:
+            yield
+            added = {key: table for key, table in self.cameras.items() if key not in before}
+            if marker:
+                calibration_of(self.source, added, "m", sizes_known=False)
+                self.markers.add(name)
+                del self.notes[notes:]
+        except CalibrationError:
+            if not marker:
+                raise
+            for key in set(self.cameras) - before:
+                del self.cameras[key]
+            del self.notes[notes:]
+            self.unusable += 1
 
     def leave_out(self, name: str, why: str) -> None:
         """Note that a camera is left out."""
@@ -121,10 +151,15 @@ def read_format(form: Format, files: Sequence[Path], folder: Path, unit: str | N
     calibration = calibration_of(tables.source, tables.cameras, "m", sizes_known=False)
     rig, unit_note = _in_metres(calibration.rig, tables, unit, form.unit)
     names = [CameraNames(camera.name, key) for camera, key in zip(rig, calibration.keys, strict=True)]
-    found = find_clips(folder, form.videos, names, trial, form.in_order)
+    marker = [camera.name in tables.markers for camera in rig]
+    found = _find_clips(form, folder, names, marker, trial)
     chosen = [index for index, clip in enumerate(found.clips) if clip is not None]
     notes = [*tables.notes, f"{tables.source}: {unit_note}", *found.notes]
-    missing = [names[index].name for index, clip in enumerate(found.clips) if clip is None]
+    without = [index for index, clip in enumerate(found.clips) if clip is None]
+    if markers := tables.unusable + sum(marker[index] for index in without):
+        total = len(names) + tables.unusable
+        notes.append(f"{tables.source}: {markers} of its {total} cameras record no videos: left out")
+    missing = [names[index].name for index in without if not marker[index]]
     if missing and form.videos_of_all:
         notes.append(f"{found.folder}: no video of {', '.join(missing)}: left out")
     elif missing:
@@ -137,9 +172,40 @@ def read_format(form: Format, files: Sequence[Path], folder: Path, unit: str | N
         clips=tuple(clip for clip in found.clips if clip is not None),
         masks=_beside(folder, found.folder, ("masks", "mask"), chosen_names, notes),
         backgrounds=_beside(folder, found.folder, ("background", "backgrounds"), chosen_names, notes),
-        up=form.up,
+        up=FoundUp(form.up, f"as {form.tool} defines it") if form.up else calibration.mounting,
+        turns=tuple(calibration.turns[index] for index in chosen),
+        fractional=tuple(_fractional(tables.cameras[calibration.keys[index]].get("size")) for index in chosen),
         notes=tuple(notes),
     )
+
+
+def _find_clips(
+    form: Format, folder: Path, names: Sequence[CameraNames], marker: Sequence[bool], trial: str | None
+) -> Found:
+    """Return the video of each camera: those of all cameras, or of the video cameras alone if these are as many."""
+    if not any(marker):
+        return find_clips(folder, form.videos, names, trial, form.in_order)
+    own = [index for index, other in enumerate(marker) if not other]
+    try:
+        some = find_clips(folder, form.videos, [names[index] for index in own], trial, form.in_order)
+    except VideoError:
+        return find_clips(folder, form.videos, names, trial, False)
+    clips: list[Path | None] = [None] * len(names)
+    for index, clip in zip(own, some.clips, strict=True):
+        clips[index] = clip
+    found = replace(some, clips=tuple(clips))
+    try:
+        every = find_clips(folder, form.videos, names, trial, False)
+    except VideoError:
+        return found
+    return max(found, every, key=lambda clips: sum(clip is not None for clip in clips.clips))
+
+
+def _fractional(size: Any) -> tuple[float, float] | None:
+    if size is None or all(float(value).is_integer() for value in np.ravel(size)):
+        return None
+    width, height = np.ravel(size).tolist()
+    return width, height
 
 
 def _in_metres(rig: Rig, tables: Tables, requested: str | None, default: str) -> tuple[Rig, str]:

@@ -22,7 +22,7 @@ from tk.io.importers.project import Format, Tables
 #: largest file, bytes; twelve numbers take 1 kB
 _LARGEST = 65_536
 
-#: a larger skew, as a share of the focal length, is reported; a smaller one is rounding of the file's numbers
+#: a smaller skew, as a share of the focal length, is rounding of the file's numbers
 _SKEW = 1e-6
 
 
@@ -34,11 +34,7 @@ def _read(files: Sequence[Path]) -> Tables:
             found.notes.append(f"{path}: holds no 3×4 matrix: left out")
             continue
         K, rotation, translation = factorise(P, str(path))
-        if abs(K[0, 1]) > _SKEW * K[0, 0]:
-            found.notes.append(
-                f"{path}: has a skew of {K[0, 1]:.3g} px, which is left out: the sides of the image move by about "
-                f"{abs(K[0, 1]) * K[1, 2] / K[1, 1]:.2g} px"
-            )
+        if abs(K[0, 1]) < _SKEW * K[0, 0]:
             K[0, 1] = 0.0
         K[[1, 2, 2], [0, 0, 1]] = 0.0  # rounding
         found.add(path.stem, [0, 0], K, np.zeros(5), rotation, translation)

@@ -15,7 +15,7 @@ FreeMoCap: Anipose's tables; FreeMoCap asks for millimetres. Without a board on 
 camera 0.
 
     RECORDING/*_camera_calibration.toml
-    RECORDING/synchronized_videos/*.mp4
+    RECORDING/synchronized_videos/*.mp4        FreeMoCap 2: RECORDING/videos/synchronized/*.mp4
 
 Pose2Sim: metres. Cameras are named by the folders of their intrinsic calibration ("int_cam01_img"); cameras and videos
 are matched in the order of their names.
@@ -91,7 +91,10 @@ CALISCOPE = Format(
 )  # fmt: skip
 FREEMOCAP = Format(
     "FreeMoCap", ("*camera_calibration.toml",), read_tables,
-    videos=("synchronized_videos", "SyncedVideos", "*/synchronized_videos", "*/SyncedVideos", "."),
+    videos=(
+        "synchronized_videos", "SyncedVideos", "videos/synchronized",
+        "*/synchronized_videos", "*/SyncedVideos", "*/videos/synchronized", ".",
+    ),
     unit="mm", nests=True, in_order=True, search=_find_freemocap,
 )  # fmt: skip
 POSE2SIM = Format(

@@ -5,7 +5,7 @@
 
 POSITION is the camera centre in millimetres; ORIENTATION is the quaternion of the rotation from world to camera (x
 right, y down, z forward), real part last. A file also lists marker cameras; a camera without calibration has no key
-frame. The videos are called `TRIAL.2114551.….avi`.
+frame. A camera with a video is a video camera, whatever its type. The videos are called `TRIAL.2114551.….avi`.
 
 Vicon's distortion model is the inverse of OpenCV's: with r the distance from the principal point in pixels, the
 undistorted point is (1 + k₁ r² + k₂ r⁴ + k₃ r⁶) times as far away. OpenCV's coefficients are fitted to it.
@@ -38,18 +38,19 @@ def _read(files: Sequence[Path]) -> Tables:
     listed = read_xml(path).findall("Camera")
     if not listed:
         raise CalibrationError(f"{path}: has no <Camera>; save the calibration from Vicon's program again")
-    videos = [item for item in listed if _records_videos(item)] or listed
     found = Tables(path, unit="mm", unit_from="the format")
-    if len(videos) < len(listed):
-        found.notes.append(
-            f"{path}: {len(listed) - len(videos)} of its {len(listed)} cameras record no videos: left out"
-        )
-    for index, item in enumerate(videos):
+    some = any(_records_videos(item) for item in listed)
+    for index, item in enumerate(listed):
         name = item.get("DEVICEID") or item.get("USERID") or str(index)
+        marker = some and not _records_videos(item)
         if item.find("KeyFrames/KeyFrame") is None:
-            found.leave_out(name, "is not calibrated")
+            if marker:
+                found.unusable += 1
+            else:
+                found.leave_out(name, "is not calibrated")
             continue
-        _add(found, item, name)
+        with found.optional(name, marker):
+            _add(found, item, name)
     return found
 
 
@@ -66,6 +67,8 @@ def _add(found: Tables, item: Element, name: str) -> None:
     cx, cy = key_frame.array("PRINCIPAL_POINT", (2,))
     if not aspect > 0 or not focal > 0:
         device.fail(f"FOCAL_LENGTH = {focal:g}, PIXEL_ASPECT_RATIO = {aspect:g} must be positive")
+    if skew := device.number("SKEW", 0.0):
+        device.fail(f"SKEW = {skew:g}: a skewed sensor in this format is not supported; calibrate without skew")
     quaternion = key_frame.array("ORIENTATION", (4,))
     if np.linalg.norm(quaternion) < 1e-6:
         key_frame.fail("ORIENTATION is not a rotation: its four numbers are zero")

@@ -22,13 +22,15 @@ from tk.io.captures.video import as_calibrated
 from tk.io.importers.project import Project
 from tk.io.paths import replacing, text_of
 from tk.model.cameras.camera import Camera, Rig
-from tk.model.cameras.common_view import closest_to_axes, common_boxes
-from tk.model.cameras.mounting import FoundUp, infer_up
-from tk.model.cameras.up import shown_up, up_text
+from tk.model.cameras.common_view import all_look_away, closest_to_axes, common_boxes
+from tk.model.cameras.up import shown, up_text
 from tk.model.cameras.volume import Volume
 
 #: least side of a working volume, metres: a person with arms spread needs more
 _ROOM_M = 1.5
+#: a size with fractions was computed from something else (Pose2Sim: from the principal point); it is off by less than
+#: this share of the image
+_ROUGH = 0.15
 #: codecs pad images to blocks of 16 pixels: a smaller difference in size is padding, removed or kept
 _BLOCK = 16
 
@@ -53,10 +55,11 @@ def write_capture(project: Project, output: Path) -> Imported:
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise CaptureError(f"{output}: exists already; remove it, or choose another name")
     notes = list(project.notes)
-    rig = _fitted(_renamed(project.rig, notes), project.clips, notes)
-    found = FoundUp(project.up, f"as {project.tool} defines it") if project.up else infer_up(rig)
+    rig = _fitted(_renamed(project.rig, notes), project, notes)
     volume, where = find_volume(rig)
-    notes.append(f"up = {shown_up(found.up)}: {found.how}")
+    if volume is None and (away := all_look_away(rig)):
+        raise CalibrationError(f"{project.source}: {away}")
+    notes.append(f"up = {shown(project.up.up)}: {project.up.how}")
     if volume is None:
         notes.append(where)
     else:
@@ -64,12 +67,13 @@ def write_capture(project: Project, output: Path) -> Imported:
         notes.append(f"[volume] center = {center}, size = {size} (metres): {where}")
 
     metadata = {"units": "m", "imported_from": f"{project.tool}, {text_of(project.source.name)}"}
-    tables = {camera.name: camera_table(camera) for camera in rig} | {"metadata": metadata}
-    settings = capture_toml(text_of(output.resolve().name), project, found, volume, where)
+    turns = project.turns or (0,) * len(rig)
+    tables = {camera.name: camera_table(camera, turn) for camera, turn in zip(rig, turns, strict=True)}
+    settings = capture_toml(text_of(output.resolve().name), project, volume, where)
     with replacing(output, CaptureError) as draft:
         shutil.rmtree(draft, ignore_errors=True)  # of an import that was killed
         draft.mkdir(parents=True)
-        (draft / "calibration.toml").write_text(tomli_w.dumps(tables), encoding="utf-8")
+        (draft / "calibration.toml").write_text(tomli_w.dumps({**tables, "metadata": metadata}), encoding="utf-8")
         (draft / "capture.toml").write_text(settings, encoding="utf-8")
         parts = {"videos": project.clips, "masks": project.masks, "background": project.backgrounds}
         copied = sum(_place(clips, rig.names, draft, folder) for folder, clips in parts.items() if clips)
@@ -117,13 +121,13 @@ def _rounded(volume: Volume) -> Volume:
     return Volume((center[0], center[1], center[2]), (size[0], size[1], size[2]))
 
 
-def capture_toml(name: str, project: Project, up: FoundUp, volume: Volume | None, where: str) -> str:
+def capture_toml(name: str, project: Project, volume: Volume | None, where: str) -> str:
     """Return the text of `capture.toml`: each inferred value with a comment on how it was inferred."""
     lines = [
         f"# imported from {project.tool}, {text_of(project.source.name)}",
         tomli_w.dumps({"name": name}).strip(),
-        f"# up: {up.how}",
-        f"up = {_up_toml(up.up)}",
+        f"# up: {project.up.how}",
+        f"up = {_up_toml(project.up.up)}",
         "",
     ]
     if volume is None:
@@ -167,11 +171,21 @@ def _renamed(rig: Rig, notes: list[str]) -> Rig:
     return Rig(tuple(cameras))
 
 
-def _fitted(rig: Rig, clips: Sequence[Path], notes: list[str]) -> Rig:
+def _fitted(rig: Rig, project: Project, notes: list[str]) -> Rig:
+    """Return the cameras with the sizes of their videos."""
     cameras = []
-    for camera, clip in zip(rig, clips, strict=True):
+    written = project.fractional or (None,) * len(rig)
+    for camera, clip, size in zip(rig, project.clips, written, strict=True):
         found = as_calibrated(probe(clip), (camera.width, camera.height))
-        fitted, note = fit_size(camera, found.width, found.height, clip)
+        shape = found.width, found.height
+        if size and all(abs(a - b) < _ROUGH * b for a, b in zip(size, shape, strict=True)):
+            fitted = replace(camera, width=found.width, height=found.height)
+            note: str | None = (
+                f"camera {camera.name!r}: its size in the calibration, {size[0]:.1f}×{size[1]:.1f}, is not an image's; "
+                f"the video's is used, {found.width}×{found.height}"
+            )
+        else:
+            fitted, note = fit_size(camera, *shape, clip)
         if note:
             notes.append(note)
         cameras.append(fitted)

@@ -114,7 +114,7 @@ class Layout:
         put_attributes(self.file.create_group("cameras"), {"names": cameras.rig.names})
         values = {
             "matrix": [camera.matrix for camera in cameras.rig],
-            "distortions": [np.pad(camera.distortions, (0, 5 - len(camera.distortions))) for camera in cameras.rig],
+            "distortions": [np.pad(camera.distortions, (0, 8 - len(camera.distortions))) for camera in cameras.rig],
             "rotation": [cv2.Rodrigues(camera.rotation)[0].ravel() for camera in cameras.rig],
             "translation": [camera.translation for camera in cameras.rig],
             "size": [(camera.width, camera.height) for camera in cameras.rig],

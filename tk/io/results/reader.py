@@ -31,7 +31,7 @@ from tk.io.results.schema import (
     smoothed_columns,
 )
 from tk.model.body.joints import in_joint_order
-from tk.model.cameras.camera import Camera, Rig
+from tk.model.cameras.camera import Camera, Rig, shortened
 
 _ENTRIES = {entry.path: entry for entry in ROWS}
 _TEXTS = {field.name for field in fields(ResultMeta) if field.type == "str"}
@@ -322,7 +322,7 @@ def _read_cameras(file: Hdf5Reader) -> UsedCameras | None:
             width=int(found["size"][c, 0]),
             height=int(found["size"][c, 1]),
             matrix=found["matrix"][c],
-            distortions=found["distortions"][c, : 4 if found["fisheye"][c] else 5],
+            distortions=shortened(found["distortions"][c], bool(found["fisheye"][c])),
             rotation=np.asarray(cv2.Rodrigues(found["rotation"][c])[0], dtype=np.float64),
             translation=found["translation"][c],
             fisheye=bool(found["fisheye"][c]),

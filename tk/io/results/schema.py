@@ -158,7 +158,7 @@ HULL = (
 CAMERAS = (
     Dataset("cameras/matrix", "C 3 3", "float64", "camera matrix, pixels", finite=True),
     Dataset(
-        "cameras/distortions", "C 5", "float64",
+        "cameras/distortions", "C 8", "float64",
         "OpenCV's order, padded with zeros; a fisheye camera uses the first four", finite=True,
     ),
     Dataset("cameras/rotation", "C 3", "float64", "Rodrigues vector, world to camera", finite=True),

@@ -262,7 +262,7 @@ def _moved(camera: Camera, parameters: Sequence[str], row: Float) -> Camera:
     moved = replace(camera, rotation=turn @ camera.rotation, translation=turn @ camera.translation + row[3:6])
     if "focal" in parameters:
         matrix = camera.matrix.copy()
-        matrix[[0, 1], [0, 1]] *= np.exp(row[6])
+        matrix[:2, :2] *= np.exp(row[6])
         moved = replace(moved, matrix=matrix)
     return moved
 

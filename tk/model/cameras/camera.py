@@ -17,12 +17,12 @@ Float = NDArray[np.float64]
 _CONVERGED = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 
-def _undistort(points: Float, matrix: Float, distortions: Float, criteria: tuple[int, int, float]) -> Float:
-    """Return normalised coordinates (N, 1, 2) of pixels (N, 1, 2), iterated until ``criteria`` hold."""
+def _undistort(points: Float, distortions: Float, criteria: tuple[int, int, float]) -> Float:
+    """Return ideal coordinates (N, 1, 2) of distorted ones (N, 1, 2), normalised, iterated until ``criteria`` hold."""
     if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4 has a separate function
-        result = cv2.undistortPointsIter(points, matrix, distortions, None, None, criteria)
+        result = cv2.undistortPointsIter(points, np.eye(3), distortions, None, None, criteria)
     else:
-        result = cv2.undistortPoints(points, matrix, distortions, criteria=criteria)
+        result = cv2.undistortPoints(points, np.eye(3), distortions, criteria=criteria)
     return np.asarray(result, dtype=np.float64)
 
 
@@ -37,8 +37,9 @@ class Camera:
     # width, height: image size, pixels
     width: int
     height: int
-    matrix: Float  # (3, 3) intrinsic matrix, pixels
-    distortions: Float  # (4,) or (5,) in OpenCV's order k1 k2 p1 p2 [k3]; (4,) k1…k4 when `fisheye`
+    matrix: Float  # (3, 3) intrinsic matrix [[fx, skew, cx], [0, fy, cy], [0, 0, 1]], pixels
+    # (4,), (5,) or (8,) in OpenCV's order k1 k2 p1 p2 [k3 [k4 k5 k6]]; (4,) k1…k4 when `fisheye`
+    distortions: Float
     rotation: Float  # (3, 3) rotation from world to camera
     translation: Float  # (3,) metres, of the world's origin in the camera frame
     fisheye: bool = False  # True for OpenCV's fisheye (equidistant) model
@@ -111,12 +112,18 @@ class Camera:
                 xy = np.asarray(distorted, np.float64)[:, 0]
         else:
             # not OpenCV's function, which takes several times as long
-            k1, k2, p1, p2, k3 = (*self.distortions, 0.0)[:5]
+            k1, k2, p1, p2, *more = self.distortions
+            k3, rational = more[0] if more else 0.0, more[1:]
             bent = squared
             radial = 1 + squared * (k1 + squared * (k2 + squared * k3))
+            if rational:
+                k4, k5, k6 = rational
+                radial /= 1 + squared * (k4 + squared * (k5 + squared * k6))
             tangential = 2 * (xy @ np.array([p2, p1]))  # along the point's direction, like the radial part
             xy = xy * (radial + tangential)[:, None] + squared[:, None] * np.array([p2, p1])
         pixels = xy * self.matrix.diagonal()[:2] + self.matrix[:2, 2]
+        if self.matrix[0, 1] != 0.0:
+            pixels[:, 0] += self.matrix[0, 1] * xy[:, 1]
         pixels[bent > self._fold] = np.nan
         return np.asarray(pixels, np.float64)
 
@@ -126,9 +133,14 @@ class Camera:
 
         Far outside the image the distortion's polynomial folds back: such a point is not visible.
         """
-        k = self.distortions[:4] if self.fisheye else np.delete(self.distortions, [2, 3])
-        # the first zero of 1 + 3 k1 s + 5 k2 s² + …, solved for 1 / s, whose highest coefficient is 1
-        roots = np.roots([1.0, *(np.arange(3, 2 * len(k) + 2, 2) * k)])
+        k = self.distortions[:4] if self.fisheye else np.delete(self.distortions, [2, 3])[:3]
+        above, below = np.array([1.0, *k]), np.array([1.0, *(() if self.fisheye else self.distortions[5:])])
+        # the derivative of r A(s) / B(s) with s = r² is (A B + 2 s (A' B - A B')) / B²; it ends at a zero of B, too
+        rate = np.convolve(above, below)
+        for factor, one, other in ((2.0, above, below), (-2.0, below, above)):
+            rate = rate + factor * np.convolve(np.arange(len(one)) * one, other)
+        # the first zero, lowest power first: solved for 1 / s, whose highest coefficient is 1
+        roots = np.concatenate([np.roots(rate), np.roots(below)])
         found = roots.real[np.isreal(roots) & (roots.real > 0)]
         return float(1 / found.max()) if len(found) else np.inf
 
@@ -137,10 +149,13 @@ class Camera:
         points = np.ascontiguousarray(np.asarray(pixels, dtype=np.float64).reshape(-1, 1, 2))
         if len(points) == 0:  # OpenCV returns a single zero for an empty array
             return np.zeros((0, 2))
+        # not by OpenCV, which ignores a skew
+        points = (points - self.matrix[:2, 2]) / self.matrix.diagonal()[:2]
+        points[..., 0] -= self.matrix[0, 1] / self.matrix[0, 0] * points[..., 1]
         if self.fisheye:
-            result = cv2.fisheye.undistortPoints(points, self.matrix, self.distortions[:4])
+            result = cv2.fisheye.undistortPoints(points, np.eye(3), self.distortions[:4])
         else:
-            result = _undistort(points, self.matrix, self.distortions, _CONVERGED)
+            result = _undistort(points, self.distortions, _CONVERGED)
         return np.asarray(result, dtype=np.float64).reshape(-1, 2)
 
     def rays(self, pixels: ArrayLike) -> Float:
@@ -159,6 +174,12 @@ class Camera:
                 & (pixels[:, 1] >= -0.5)
                 & (pixels[:, 1] < self.height - 0.5)
             )
+
+
+def shortened(distortions: Float, fisheye: bool) -> Float:
+    """Return coefficients as :attr:`Camera.distortions` has them, without zeros at the end: (4,), (5,) or (8,)."""
+    last = int(np.flatnonzero(distortions).max(initial=-1)) + 1
+    return distortions[: 4 if fisheye else 5 if last <= 5 else 8]
 
 
 def _scaled(matrix: Float, scale: float) -> Float:

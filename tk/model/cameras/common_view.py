@@ -44,6 +44,20 @@ def closest_to_axes(rig: Rig) -> Float:
     return point
 
 
+def all_look_away(rig: Rig) -> str | None:
+    """Return what is wrong if every camera looks away from the point closest to all optical axes; None otherwise."""
+    try:
+        middle = closest_to_axes(rig)
+    except VolumeError:
+        return None
+    if any(camera.to_camera(middle)[0, 2] > 0 for camera in rig):
+        return None
+    return (
+        f"all {len(rig)} cameras look away from the point where their axes meet; are their rotations in OpenGL's axes "
+        "(y up, z backwards)? They must be in OpenCV's: x right, y down, z forward"
+    )
+
+
 def closest_to_lines(origins: Float, directions: Float) -> Float | None:
     """Return the point (3,) with the least sum of squared distances to lines; None if they are parallel.
 

@@ -59,9 +59,9 @@ def up_text(up: str | Sequence[float] | Float) -> str:
     return json.dumps([float(value) for value in vector])
 
 
-def shown_up(up: str) -> str:
-    """Return a direction as messages show it: the axis's name, or a vector with three decimals."""
-    return up if not up.startswith("[") else f"[{', '.join(f'{value:.3f}' for value in up_vector(up))}]"
+def shown(up: str) -> str:
+    """Return the text of a direction for messages: a vector with three digits."""
+    return up if up in UP_AXES else f"[{', '.join(f'{value + 0.0:.3f}' for value in up_vector(up).round(3))}]"
 
 
 def _unit(values: ArrayLike) -> Float:
