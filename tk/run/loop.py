@@ -244,7 +244,7 @@ class Loop:
             whole = replace(estimate, frame=observation.index, time=observation.time, person=number)
             whole = replace(whole, masks=None, drawn=None, mask_source=observation.sources)
             if whole.landmarks is not None:
-                seen = self.plan.task.setup.rig.recorded_pixels(whole.landmarks).astype(np.float32)
+                seen = self.plan.task.setup.rig.recorded_pixels(whole.landmarks)
                 whole = replace(whole, landmarks=seen)
             present.append(whole)
         return tuple(present)

@@ -346,7 +346,10 @@ class _Finisher:
         if source is None or source.frame_count is None or not (self.alone if late.any() else out.any()):
             return []
         _LOG.info("tracking again with the refined cameras")
-        done = track_again(first, now, source, task.setup, member.subject, self.within)
+        seen = retimed_landmarks(self._landmarks(draft), result.frames, late)
+        landmarks = {} if seen is None else dict(zip(result.frames.tolist(), seen, strict=True))
+        landmarks = {frame: own for frame, own in landmarks.items() if np.isfinite(own).any()}
+        done = track_again(first, now, source, task.setup, member.subject, landmarks, self.within)
         if done is None:
             return None
         found, monitor = done

@@ -110,7 +110,13 @@ def explains_better(second: Run, first: Run) -> bool:
 
 
 def track_again(
-    first: Run, now: Used, source: Source, setup: Setup, subject: Subject, within: Callable[[float], None]
+    first: Run,
+    now: Used,
+    source: Source,
+    setup: Setup,
+    subject: Subject,
+    landmarks: Mapping[int, Float],
+    within: Callable[[float], None],
 ) -> tuple[Mapping[int, Estimate], CameraMonitor] | None:
     """Track the frames of a run again in which every camera has an image, from its first pose on, and judge all cameras
     anew; return the estimates by frame, and the monitor. None if nobody can be tracked so.
@@ -123,6 +129,7 @@ def track_again(
         source: with the new delays; its length is known.
         setup: the scene.
         subject: what is known of the person.
+        landmarks: (C, L, 3) of the person by frame, with the new delays, where there are any.
         within: receives the share that is done.
     """
     (tracker, masks), frame_count = now, source.frame_count
@@ -136,7 +143,13 @@ def track_again(
     found: dict[int, Estimate] = {}
     with source.frames(begin, stop) as images:
         frames = (
-            Observation(frame.index, frame.images, masks.get(frame.index), time=frame.time)
+            Observation(
+                frame.index,
+                frame.images,
+                masks.get(frame.index),
+                time=frame.time,
+                landmarks=landmarks[frame.index][None] if frame.index in landmarks else None,
+            )
             for frame in images
             if frame.index in masks
         )

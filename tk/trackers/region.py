@@ -431,7 +431,9 @@ class RegionTracker(ContourTracker):
             variance += disagreement(skeleton, poses, cost)
         return np.asarray(np.sqrt(variance))
 
-    def variance(self, pose: Float, curvature: Float, prior: Quadratic, label: NDArray[np.uint8], residual: Float) -> Float:
+    def variance(
+        self, pose: Float, curvature: Float, prior: Quadratic, label: NDArray[np.uint8], residual: Float
+    ) -> Float:
         """Return (..., J) variance of the joints' positions along an axis, metres², from the contours' noise and the
         directions of the views, scaled by the residual; NaN if the views used do not determine depth.
 

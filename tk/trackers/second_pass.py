@@ -29,7 +29,7 @@ from tk.model.body.body_fit import STATURE_DEVIATION
 from tk.model.body.joint_sigma import directions, posture_variance
 from tk.model.body.limb_candidates import Limb, exchanged
 from tk.model.body.skeleton import JOINTS
-from tk.model.cues.ray_costs import Evidence, residual_of
+from tk.model.cues.ray_costs import residual_of
 from tk.model.masks.silhouettes import Pyramid
 from tk.trackers.hypotheses import DROPPED, RENEWAL
 from tk.trackers.limb_search import SAME_POSE_M

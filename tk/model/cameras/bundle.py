@@ -208,11 +208,11 @@ class ContourBundle:
         for f, (frame, pose) in enumerate(zip(self.frames, state.poses, strict=True)):
             difference, excess = np.zeros(D), np.zeros(D)
             if frame.pyramid.landmarks is not None:
-                rows = LandmarkCue(state.rig, linear.body, frame.pyramid.landmarks).rows(pose[None])
+                said = LandmarkCue(state.rig, linear.body, frame.pyramid.landmarks).rows(pose[None])
                 by_body = self.family.landmark_rows(state.body, linear.body, pose)
-                H, g = rows.normal_equations(np.concatenate([rows.jacobian, by_body[None]], axis=-1))
-                columns = np.concatenate([np.arange(P), np.arange(D + S - K, D + S)])
-                found.add_normal(f, columns, seen * H[0], seen * g[0])
+                hessian, gradient = said.normal_equations(np.concatenate([said.jacobian, by_body[None]], axis=-1))
+                unknowns = np.concatenate([np.arange(P), np.arange(D + S - K, D + S)])
+                found.add_normal(f, unknowns, seen * hessian[0], seen * gradient[0])
             difference[:P] = np.where(s.is_straight, 0.0, frame.pose) - pose
             excess[:P] = s.clip(pose) - pose
             found.add_block_prior(f, precision, difference)

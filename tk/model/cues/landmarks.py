@@ -108,7 +108,7 @@ class LandmarkCue:
         seen = _normalised(rig, seen)
         self._place = places(body.dimensions) @ body.skeleton.T_world_body.T
         size = body.dimensions.stature / AVERAGE_STATURE_M
-        known = np.isfinite(seen).all(axis=-1)
+        known = np.asarray(np.isfinite(seen).all(axis=-1))
         visibility = np.where(known, seen[..., 2], 0.0)
         self._sigma = SEEN_M * size * HIDDEN ** (1.0 - visibility)  # (..., V, L)
         self._right = np.where(known, RIGHT_HIDDEN + (RIGHT_SEEN - RIGHT_HIDDEN) * visibility, 0.0)
@@ -199,7 +199,7 @@ def log_ratio(distance_m: Float, visibility: Float) -> float:
 
 
 def _normalised(rig: Rig, landmarks: Float) -> Float:
-    """Return landmarks (..., V, L, 3), x and y in pixels, with x and y on the plane at distance 1 before each camera."""
+    """Return landmarks (..., V, L, 3), x and y in pixels, with x and y on the plane at distance 1 before a camera."""
     result = np.full(landmarks.shape, np.nan)
     for c, camera in enumerate(rig):
         known = np.isfinite(landmarks[..., c, :, :]).all(axis=-1)

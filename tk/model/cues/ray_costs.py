@@ -153,7 +153,7 @@ class Evidence:
 
     def nats(self, cost: Float, poses: Float) -> Float:
         """Return :meth:`score` of poses (B, D) whose rays have :meth:`costs` (B,)."""
-        views = max(np.count_nonzero(self._seen), 1)
+        views = max(int(np.count_nonzero(self._seen)), 1)
         return np.asarray(VIEW_NATS * views * cost + (0.0 if self.landmarks is None else self.landmarks.score(poses)))
 
     def cast(self, body: ConeBody, poses: Float, drawn: NDArray[np.int32] | None = None) -> tuple[Float, Cast]:

@@ -52,7 +52,7 @@ class Pyramid:
     def of_views(self, views: NDArray[np.intp]) -> Pyramid:
         """Return the scales of some views."""
         landmarks = None if self.landmarks is None else self.landmarks[..., views, :, :]
-        masks, sizes = (tuple(each[views] for each in scales) for scales in (self.masks, self.sizes))
+        masks, sizes = tuple(level[views] for level in self.masks), tuple(size[views] for size in self.sizes)
         return Pyramid(masks, sizes, landmarks)
 
 
