@@ -22,7 +22,7 @@ from tk.kernels.mask_values import PERSON
 from tk.model.body.body_points import POINTS, SEGMENT, places
 from tk.model.body.cone_body import ConeBody
 from tk.model.body.initial_pose import pose_of_joints
-from tk.model.body.joints import JOINTS, LIMBS, side_of
+from tk.model.body.joints import HIPS, JOINTS, LIMBS, SHOULDERS, side_of
 from tk.model.body.skeleton import Skeleton
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.triangulation import triangulate_joints
@@ -207,6 +207,32 @@ def _normalised(rig: Rig, landmarks: Float) -> Float:
             seen = landmarks[..., c, :, :][known]
             result[..., c, :, :][known] = np.column_stack([camera.undistort(seen[:, :2]), seen[:, 2]])
     return result
+
+
+def contradiction(rig: Rig, body: ConeBody, pose: Float, seen: Float) -> Float:
+    """Return (J,) variance of the joints' positions along an axis, metres², by which a pose (D,) and the triangulated
+    landmarks (V, L, 3) contradict each other beyond the landmarks' own errors.
+
+    Either may be right, so half of the squared distance counts. Neck and pelvis have the mean of shoulders and hips,
+    the crown that of the face.
+    """
+    points, _ = triangulate_joints(rig, seen)
+    size = body.dimensions.stature / AVERAGE_STATURE_M
+    known = np.isfinite(seen).all(axis=-1)
+    visibility = np.where(known, seen[..., 2], 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    expected = 3 * (np.hypot(OFFSET_M, SEEN_M) * size * HIDDEN ** (1.0 - visibility)) ** 2
+    place = places(body.dimensions) @ body.skeleton.T_world_body.T
+    square = ((body.skeleton.points(pose, SEGMENT, place) - points) ** 2).sum(axis=-1)
+    right = RIGHT_HIDDEN + (RIGHT_SEEN - RIGHT_HIDDEN) * visibility
+    excess = np.where(np.isfinite(square), right * np.maximum(square - expected, 0.0) / 6, 0.0)
+    by_name = dict(zip(LANDMARKS, excess.tolist(), strict=True))
+
+    def of(names: tuple[str, ...]) -> float:
+        return float(np.mean([by_name[name] for name in names]))
+
+    face = tuple(name for name in LANDMARKS if POINTS[name].segment == "head")
+    middle = {"pelvis": HIPS, "neck": SHOULDERS, "head_top": face}
+    return np.array([by_name[joint] if joint in by_name else of(middle[joint]) for joint in JOINTS])
 
 
 def propose(rig: Rig, skeleton: Skeleton, seen: Float) -> Float:
