@@ -207,7 +207,8 @@ def test_equations_are_the_sums_of_the_edgels_rows():
 
 STEPS = NewtonSteps(
     np.arange(D, dtype=np.int32),
-    np.vstack([BODY.skeleton.lower, BODY.skeleton.upper, np.full(D, 0.1), np.tile(POSE, (3, 1))]),
+    np.vstack([BODY.skeleton.lower, BODY.skeleton.upper, np.tile(0.1 * POSE, (3, 1))]),
+    0.1 * np.eye(D)[None],
     np.array([0.02, 5e-4, 1.0, 0.5, 0.0, 1.6, 1.6, 1.0]),
 )
 
@@ -236,7 +237,7 @@ def test_step_solves_the_damped_equations():
     here = equations_of(BODY, MASKS, start, PLAIN)
     numbers = np.array([0.02, 0.0, 0.0, 100.0, 0.0, 1.6])
     found = descent_of(MASKS, start, STEPS._replace(numbers=numbers)).poses
-    index, precision = STEPS.free, STEPS.priors[2]
+    index, precision = STEPS.free, np.diag(STEPS.matrix[0])
     for b, (H, g) in enumerate(zip(here.hessian, here.gradient, strict=True)):
         H = H + np.diag(0.02 * np.diag(H) + precision)
         g = g + precision * (POSE - start[b])

@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tk.errors import ConfigError
-from tk.kernels.newton import LENGTHS, MEAN, TOLERANCE, newton_step
+from tk.kernels.newton import LENGTHS, LINEAR, TOLERANCE, newton_step
 from tk.kernels.runtime import ensure_runtime, ti
 from tk.kernels.silhouette import Descent
 from tk.optim import gauss_newton
-from tk.optim.gauss_newton import GaussNewtonSettings, Prior
+from tk.optim.gauss_newton import GaussNewtonSettings
+from tk.optim.quadratic import Quadratic
 
 UNDAMPED = GaussNewtonSettings(scales=1, iterations=1, damping=0.0, stiffness=0.0, longest_step=100.0)
 NONE = (np.full(4, -np.inf), np.full(4, np.inf))
@@ -24,7 +25,8 @@ ALL = None
 @ti.kernel
 def _step_kernel(
     free: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    priors: ti.types.ndarray(dtype=ti.f64, ndim=2),
+    terms: ti.types.ndarray(dtype=ti.f64, ndim=2),
+    matrix: ti.types.ndarray(dtype=ti.f64, ndim=3),
     numbers: ti.types.ndarray(dtype=ti.f64, ndim=1),
     length: ti.f64,
     hessian: ti.types.ndarray(dtype=ti.f64, ndim=3),
@@ -34,10 +36,10 @@ def _step_kernel(
     change: ti.types.ndarray(dtype=ti.f64, ndim=1),
 ):
     for b in range(state.shape[0]):
-        change[b] = newton_step(free, priors, numbers, b, length, hessian, gradient, ti.static(0), factor, state)
+        change[b] = newton_step(free, terms, matrix, numbers, b, length, hessian, gradient, ti.static(0), factor, state)
 
 
-def solve(equations, start, free=ALL, lower=NONE[0], upper=NONE[1], config=None, prior=None, levels=None):
+def solve(equations, start, free=ALL, lower=NONE[0], upper=NONE[1], config=None, terms=None, levels=None):
     """The solution of a problem with the given equations."""
     ensure_runtime()
 
@@ -47,8 +49,9 @@ def solve(equations, start, free=ALL, lower=NONE[0], upper=NONE[1], config=None,
         for length in steps.numbers[LENGTHS:]:
             moved, change, scratch = states[rows], np.zeros(len(rows)), np.zeros((len(rows), 4, 5))
             here = equations(moved.copy(), scale, rows)
-            priors = np.vstack([steps.priors[:MEAN], steps.priors[MEAN + rows]])
-            numbers = steps.free, priors, steps.numbers, length
+            terms = np.vstack([steps.terms[:LINEAR], steps.terms[LINEAR + rows]])
+            matrix = steps.matrix[rows] if len(steps.matrix) > 1 else steps.matrix
+            numbers = steps.free, terms, matrix, steps.numbers, length
             _step_kernel(*numbers, here.hessian, here.gradient, scratch, moved, change)
             states[rows], hessian[rows] = moved, here.hessian
             made[rows] += 1
@@ -57,7 +60,7 @@ def solve(equations, start, free=ALL, lower=NONE[0], upper=NONE[1], config=None,
                 break
         return Descent(states, hessian, made)
 
-    return gauss_newton.minimise(descend, start, free, lower, upper, config, prior, levels)
+    return gauss_newton.minimise(descend, start, free, lower, upper, config, terms, levels)
 
 
 def minimise(*arguments, **options):
@@ -220,6 +223,10 @@ def test_scale_ends_once_no_parameter_moves_by_more_than_the_tolerance(seed):
     assert plain.iterations.tolist() == [30, 30]
 
 
+def constant(term):
+    return lambda _: term
+
+
 @given(seed=st.integers(0, 10**6), each=st.booleans())
 @settings(max_examples=30)
 def test_prior_is_a_further_measurement(seed, each):
@@ -227,31 +234,75 @@ def test_prior_is_a_further_measurement(seed, each):
     A, y, start = problem(seed)
     rng = np.random.default_rng(seed + 1)
     mean, precision = rng.normal(size=(3, 4) if each else 4), rng.uniform(0, 5, 4)
-    found = minimise(linear(A, y), start, ALL, *NONE, UNDAMPED, Prior(mean, precision))
+    prior = Quadratic.about(mean, precision)
+    found = minimise(linear(A, y), start, ALL, *NONE, UNDAMPED, constant(prior))
     for state, m in zip(found, np.broadcast_to(mean, (3, 4)), strict=True):
         expected = np.linalg.solve(A.T @ A + np.diag(precision), A.T @ y + precision * m)
         np.testing.assert_allclose(state, expected, rtol=1e-4, atol=1e-5)
 
 
+@given(seed=st.integers(0, 10**6), own=st.booleans(), free=st.sampled_from([None, [0, 2], [3]]))
+@settings(max_examples=30)
+def test_quadratic_term_enters_with_its_whole_matrix(seed, own, free):
+    """The minimum of ½‖A p − y‖² + ½ pᵀM p − lᵀp; parameters that are not free keep their part of M p."""
+    A, y, start = problem(seed)
+    rng = np.random.default_rng(seed + 1)
+    root, linear_part = rng.normal(size=(3 if own else 1, 4, 4)), rng.normal(size=(3 if own else 1, 4))
+    term = Quadratic(linear_part, root @ root.swapaxes(1, 2))
+    found = minimise(linear(A, y), start, None if free is None else np.array(free), *NONE, UNDAMPED, constant(term))
+    for b, state in enumerate(found):
+        i = np.arange(4) if free is None else np.array(free)
+        M, H = term.matrix[b % len(term.matrix)], A.T @ A
+        g = A.T @ (y - A @ start[b]) + term.linear[b % len(term.linear)] - M @ start[b]
+        expected = start[b].copy()
+        expected[i] += np.linalg.solve((H + M)[np.ix_(i, i)], g[i])
+        np.testing.assert_allclose(state, expected, rtol=1e-3, atol=1e-4)
+
+
+def test_terms_are_taken_about_the_states_at_the_start_of_each_scale():
+    A, y, start = problem(5)
+    seen = []
+
+    def terms(states):
+        seen.append(states.copy())
+        return Quadratic.about(states, np.ones(4))
+
+    config = GaussNewtonSettings(scales=3, iterations=2)
+    minimise(linear(A, y), start, ALL, *NONE, config, terms)
+    assert len(seen) == 3
+    np.testing.assert_array_equal(seen[0], start)
+    assert np.abs(seen[1] - seen[0]).max() > 1e-3
+
+
+def test_sum_and_multiple_of_quadratics_are_those_of_their_costs():
+    rng = np.random.default_rng(3)
+    one, other = (Quadratic(rng.normal(size=(n, 4)), rng.normal(size=(n, 4, 4))) for n in (1, 3))
+    p = rng.normal(size=4)
+
+    def cost(term):
+        return 0.5 * np.einsum("i,bij,j->b", p, term.matrix, p) - term.linear @ p
+
+    np.testing.assert_allclose(cost(one + other.scaled(2.0)), cost(one) + 2.0 * cost(other))
+
+
 def test_precise_prior_holds_the_state_and_zero_precision_has_no_effect():
     A, y, start = problem(6)
     config = GaussNewtonSettings(scales=1, iterations=5)
-    held = Prior(start, np.array([1e9, 0.0, 1e9, 0.0]))
-    found = minimise(linear(A, y), start, ALL, *NONE, config, held)
+    held = Quadratic.about(start, np.array([1e9, 0.0, 1e9, 0.0]))
+    found = minimise(linear(A, y), start, ALL, *NONE, config, constant(held))
     np.testing.assert_allclose(found[:, [0, 2]], start[:, [0, 2]], atol=1e-6)
     assert np.abs(found[:, [1, 3]] - start[:, [1, 3]]).min() > 1e-3
     without = minimise(linear(A, y), start, ALL, *NONE, config)
-    weak = minimise(linear(A, y), start, ALL, *NONE, config, Prior(start + 9.0, np.zeros(4)))
+    weak = minimise(linear(A, y), start, ALL, *NONE, config, constant(Quadratic.about(start + 9.0, np.zeros(4))))
     np.testing.assert_array_equal(weak, without)
 
 
 def test_prior_determines_parameters_without_evidence():
     A, y, start = problem(7)
     A[:, 2] = 0.0
-    prior = Prior(np.array([0, 0, 0.3, 0]), np.array([0, 0, 1e3, 0.0]))
-    found = minimise(
-        linear(A, y), start, ALL, *NONE, GaussNewtonSettings(scales=1, iterations=8, longest_step=9), prior
-    )
+    prior = constant(Quadratic.about(np.array([0, 0, 0.3, 0]), np.array([0, 0, 1e3, 0.0])))
+    config = GaussNewtonSettings(scales=1, iterations=8, longest_step=9)
+    found = minimise(linear(A, y), start, ALL, *NONE, config, prior)
     np.testing.assert_allclose(found[:, 2], 0.3, atol=1e-3)
 
 
