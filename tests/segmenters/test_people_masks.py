@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from tests.model.ring import ring_of_cameras
 from tests.people import VOLUME, person_mask
 from tk.errors import ConfigError
+from tk.model.cameras.triangulation import triangulate_joints
 from tk.model.cameras.volume import Volume
+from tk.model.cues.landmarks import LANDMARKS
 from tk.model.masks.sightings import Sighting
 from tk.segmenters.people_masks import PeopleMasks
 
@@ -116,34 +118,70 @@ def test_another_detection_of_the_same_person_changes_nothing() -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def test_landmarks_of_everybody_are_triangulated_where_cameras_agree() -> None:
-    """The segmenter takes the top of a mask for the shoulders, the lower end for the ankles, and sees nothing else."""
+class Posed(OneOfMany):
+    """Takes the top of a mask for the shoulders, the lower end for the ankles, and sees nothing else."""
 
-    class Posed(OneOfMany):
-        def segment_pose(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-            found, landmarks = self.segment(image), np.full((12, 3), np.nan)
-            y, x = np.nonzero(found > 0.5)
-            if len(x):
-                landmarks[:2], landmarks[-2:] = (x.mean(), y.min(), 0.9), (x.mean(), y.max(), 0.9)
-            return found, landmarks
+    def segment_pose(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        found, landmarks = self.segment(image), np.full((12, 3), np.nan)
+        y, x = np.nonzero(found > 0.5)
+        if len(x):
+            landmarks[:2], landmarks[-2:] = (x.mean(), y.min(), 0.9), (x.mean(), y.max(), 0.9)
+        return found, landmarks
 
+
+class Named(OneOfMany):
+    """Names its landmarks; one of them is none of ours."""
+
+    landmarks = ("navel", "toe_r", "nose")
+
+    def segment_pose(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        found, landmarks = self.segment(image), np.full((3, 3), np.nan)
+        y, x = np.nonzero(found > 0.5)
+        if len(x):
+            landmarks[1:] = (x.mean(), y.max(), 0.7), (x.mean(), y.min(), 0.8)
+        return found, landmarks
+
+
+@pytest.mark.parametrize(
+    ("segmenter", "top", "bottom"),
+    [(Posed(), ("shoulder_l", "shoulder_r"), ("ankle_l", "ankle_r")), (Named(), ("nose",), ("toe_r",))],
+    ids=["twelve without names", "with names"],
+)
+def test_landmarks_of_everybody_in_each_image_are_returned(
+    segmenter: OneOfMany, top: tuple[str, ...], bottom: tuple[str, ...]
+) -> None:
     places = [(-0.6, 0.2), (0.6, -0.1)]
     images, _ = shown(places)
-    landmarks = masks_of(Posed()).label(images).landmarks
-    assert landmarks.shape == (2, 12, 3) and np.isnan(landmarks[:, 2:-2]).all()
-    for person, at in zip(landmarks[np.argsort(landmarks[:, 0, 0])], places, strict=True):
-        np.testing.assert_allclose(person[[0, 1]], [(*at, 1.75)] * 2, atol=0.15)
-        np.testing.assert_allclose(person[[10, 11]], [(*at, 0.0)] * 2, atol=0.15)
-    assert np.isnan(masks_of(OneOfMany()).label(images).landmarks).all()
+    landmarks = masks_of(segmenter).label(images).landmarks
+    assert landmarks.shape == (2, 4, len(LANDMARKS), 3)
+    rows = [LANDMARKS.index(name) for name in top + bottom]
+    assert np.isnan(np.delete(landmarks, rows, axis=2)).all()
+    feet = [triangulate_joints(RIG, person)[0][LANDMARKS.index(bottom[0])] for person in landmarks]
+    for k, at in zip(np.argsort([foot[0] for foot in feet]), places, strict=True):
+        points = triangulate_joints(RIG, landmarks[k])[0]
+        for names, height in ((top, 1.75), (bottom, 0.0)):
+            for name in names:
+                np.testing.assert_allclose(points[LANDMARKS.index(name)], (*at, height), atol=0.15)
 
 
-def test_landmarks_of_another_shape_are_refused() -> None:
+def test_segmenter_without_landmarks_returns_unknown_ones() -> None:
+    found = masks_of(OneOfMany()).label(shown([(0.2, 0.1)])[0])
+    assert found.landmarks.shape == (1, 4, len(LANDMARKS), 3) and np.isnan(found.landmarks).all()
+    nobody = masks_of(Posed()).label(shown([])[0])
+    assert nobody.landmarks.shape == (0, 4, len(LANDMARKS), 3)
+
+
+@pytest.mark.parametrize(("names", "count"), [((), 12), (("nose", "heel_l"), 2)])
+def test_landmarks_of_another_shape_are_refused(names: tuple[str, ...], count: int) -> None:
     class Wrong(OneOfMany):
         def segment_pose(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
             return self.segment(image), np.zeros((17, 2))
 
-    with pytest.raises(ConfigError, match=r"segmenter one: returned landmarks \(17, 2\); they must be \(12, 3\)"):
-        masks_of(Wrong()).label(shown([(0.2, 0.1)])[0])
+    segmenter = Wrong()
+    if names:
+        segmenter.landmarks = names  # type: ignore[attr-defined]
+    with pytest.raises(ConfigError, match=rf"segmenter one: returned landmarks \(17, 2\); they must be \({count}, 3\)"):
+        masks_of(segmenter).label(shown([(0.2, 0.1)])[0])
 
 
 def test_masks_do_not_change_the_images() -> None:

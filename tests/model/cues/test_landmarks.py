@@ -1,45 +1,230 @@
-"""Landmarks: whose they are, and when they contradict a pose."""
+"""Landmarks as a term of the cost: derivatives, the choice between poses, whose landmarks they are."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
-from tests.trackers.walker import BODY, walk
+from tests.model.figures import draw_silhouettes
+from tests.model.landmarks import body_points, landmarks_of, mirrored
+from tests.model.ring import ring_of_cameras
+from tests.trackers.walker import BODY, NAMES, STATURE, walk
+from tk.kernels.mask_values import OTHERS
+from tk.model.body.limb_candidates import limbs_of, turned
 from tk.model.body.skeleton import JOINTS
-from tk.model.cues.landmarks import LANDMARKS, ROWS, contradiction, of_person
+from tk.model.cues.landmarks import (
+    EXCHANGED,
+    INDEPENDENT,
+    JOINT_LANDMARKS,
+    LANDMARKS,
+    OFFSET_M,
+    SEEN_M,
+    LandmarkCue,
+    contradiction,
+    of_person,
+    propose,
+)
+from tk.model.setup import AVERAGE_STATURE_M
 
-JOINTS_M = BODY.skeleton.joints(walk(1)[0])
-SWAPPED = np.arange(len(LANDMARKS)) ^ 1
-
-
-def test_landmarks_are_joints_left_and_right_in_turn() -> None:
-    assert [JOINTS[row] for row in ROWS] == list(LANDMARKS)
-    assert [LANDMARKS[k].replace("_r", "_l") for k in SWAPPED] == [name.replace("_r", "_l") for name in LANDMARKS]
-
-
-def test_the_nearest_person_is_chosen_and_nobody_far_away() -> None:
-    here, beside = JOINTS_M[ROWS], JOINTS_M[ROWS] + [0.6, 0.0, 0.0]
-    found = of_person(np.array([beside, here]), JOINTS_M)
-    np.testing.assert_array_equal(found, here)
-    assert of_person(beside[None], JOINTS_M) is None
-    assert of_person(np.zeros((0, 12, 3)), JOINTS_M) is None
-
-
-def test_a_person_of_whom_little_is_known_is_nobody() -> None:
-    landmarks = JOINTS_M[ROWS].copy()
-    landmarks[LANDMARKS.index("knee_l")] = np.nan
-    assert of_person(landmarks[None], JOINTS_M) is not None
-    landmarks[[LANDMARKS.index(name) for name in ("knee_r", "ankle_l")]] = np.nan
-    assert of_person(landmarks[None], JOINTS_M) is None
+RIG = ring_of_cameras(4, 160, 200)
+POSE = walk(9)[8]
+SEEN = landmarks_of(RIG, BODY, POSE)
+NOISY = landmarks_of(RIG, BODY, POSE, 0.03)
+TURNED = turned(POSE, limbs_of(BODY))
 
 
-@pytest.mark.parametrize("part", ["shoulder hip", "elbow wrist", "knee ankle"])
-def test_exchanged_sides_contradict_whatever_the_other_parts_show(part: str) -> None:
-    landmarks = JOINTS_M[ROWS] + np.random.default_rng(2).normal(0.0, 0.03, (12, 3))
-    assert contradiction(landmarks, JOINTS_M) < 0.1
-    rows = [k for k, name in enumerate(LANDMARKS) if name[:-2] in part.split()]
-    landmarks[rows] = landmarks[SWAPPED[rows]]
-    assert contradiction(landmarks, JOINTS_M) > 0.15
-    both = contradiction(landmarks, np.stack([JOINTS_M, JOINTS_M + 1.0]))
-    assert both.shape == (2,) and both[0] == contradiction(landmarks, JOINTS_M) and both[1] > 1.0
+def far(pose: np.ndarray) -> float:
+    """Largest distance of a pose's joints from those of :data:`POSE`, metres."""
+    return float(np.linalg.norm(BODY.skeleton.joints(pose) - BODY.skeleton.joints(POSE), axis=1).max())
+
+
+# --- the normal equations -----------------------------------------------------------------------------------------
+
+
+def marginal_cost(pose: np.ndarray, seen: np.ndarray) -> float:
+    """Negative logarithm of the density of certain landmarks whose offsets are integrated out, nats."""
+    points, size = body_points(BODY, pose), STATURE / AVERAGE_STATURE_M
+    rows, away = [], []
+    for v, camera in enumerate(RIG):
+        q = camera.to_camera(points)
+        away.append(camera.undistort(seen[v, :, :2]) * q[:, 2:] - q[:, :2])
+        rows.append(camera.rotation[:2] - (q[:, :2] / q[:, 2:])[..., None] * camera.rotation[2])
+    P, r = np.concatenate(rows, axis=1), np.concatenate(away, axis=1)  # (L, 2 V, 3), (L, 2 V)
+    covariance = size**2 * (SEEN_M**2 * np.eye(r.shape[1]) + OFFSET_M**2 * P @ P.swapaxes(1, 2))
+    return float(0.5 * INDEPENDENT * (r * np.linalg.solve(covariance, r[..., None])[..., 0]).sum())
+
+
+def test_gradient_is_that_of_the_cost_with_offsets_integrated_out() -> None:
+    seen = landmarks_of(RIG, BODY, POSE, 0.002, visibility=1.0)
+    near = POSE + np.random.default_rng(2).normal(0.0, 0.003, len(POSE))
+    found = LandmarkCue(RIG, BODY, seen).normal(near[None])
+    gradient = found.matrix[0] @ near - found.linear[0]
+    step = 1e-5 * np.eye(len(POSE))
+    expected = [(marginal_cost(near + row, seen) - marginal_cost(near - row, seen)) / 2e-5 for row in step]
+    np.testing.assert_allclose(gradient, expected, atol=0.02 * np.abs(expected).max())
+
+
+def test_matrix_is_symmetric_and_positive_semi_definite_even_of_wrong_landmarks() -> None:
+    poses = walk(3) + np.random.default_rng(3).normal(0.0, 0.2, (3, len(POSE)))
+    found = LandmarkCue(RIG, BODY, NOISY).normal(poses)
+    assert found.linear.shape == poses.shape
+    np.testing.assert_allclose(found.matrix, found.matrix.swapaxes(1, 2), rtol=1e-9, atol=1e-6)
+    assert (np.linalg.eigvalsh(found.matrix) > -1e-6 * np.abs(found.matrix).max()).all()
+
+
+def test_landmarks_of_several_frames_are_compared_with_their_own_poses() -> None:
+    poses = walk(2)
+    seen = np.stack([landmarks_of(RIG, BODY, pose, 0.02) for pose in poses])
+    seen[1, 2] = np.nan
+    both = LandmarkCue(RIG, BODY, seen)
+    for k, pose in enumerate(poses):
+        alone = LandmarkCue(RIG, BODY, seen[k])
+        np.testing.assert_allclose(both.score(poses)[k], alone.score(pose[None])[0])
+        for one, other in zip(both.normal(poses), alone.normal(pose[None]), strict=True):
+            np.testing.assert_allclose(one[k], other[0], rtol=1e-9, atol=1e-6)
+
+
+def test_unknown_landmarks_say_nothing() -> None:
+    nothing = LandmarkCue(RIG, BODY, np.full(SEEN.shape, np.nan))
+    found = nothing.normal(POSE[None])
+    assert not found.matrix.any() and not found.linear.any()
+    assert np.ptp(nothing.score(np.stack([POSE, TURNED]))) == 0.0
+
+
+# --- the choice between poses -------------------------------------------------------------------------------------
+
+
+def test_score_is_lowest_at_the_true_pose() -> None:
+    rng = np.random.default_rng(4)
+    others = POSE + rng.choice([-0.15, 0.15], (40, len(POSE)))
+    score = LandmarkCue(RIG, BODY, NOISY).score(np.concatenate([POSE[None], others]))
+    assert (score[0] < score[1:] - 5.0).all()
+
+
+@pytest.mark.parametrize("views", [[0, 1], [0, 1, 2, 3]])
+def test_true_heading_is_preferred_to_the_opposite_one(views: list[int]) -> None:
+    seen = NOISY.copy()
+    seen[[v for v in range(len(RIG)) if v not in views]] = np.nan
+    score = LandmarkCue(RIG, BODY, seen).score(np.stack([POSE, TURNED]))
+    assert score[1] - score[0] > 5.0
+
+
+def test_exchanged_sides_in_one_image_cost_no_more_than_their_prior() -> None:
+    poses = np.stack([POSE, TURNED])
+    spoilt = NOISY.copy()
+    spoilt[1] = mirrored(NOISY[1])
+    right, wrong = (LandmarkCue(RIG, BODY, seen).score(poses) for seen in (NOISY, spoilt))
+    assert 0 < wrong[0] - right[0] <= 2 * INDEPENDENT * np.log((1 - EXCHANGED) / EXCHANGED)
+    assert wrong[1] - wrong[0] > 5.0  # the other images show the heading
+
+
+@pytest.mark.parametrize("half", ["upper", "lower"])
+def test_one_half_is_exchanged_without_the_other(half: str) -> None:
+    spoilt = NOISY.copy()
+    spoilt[1] = mirrored(NOISY[1], lower=half == "lower", upper=half == "upper")
+    right, wrong = (LandmarkCue(RIG, BODY, seen).score(POSE[None])[0] for seen in (NOISY, spoilt))
+    assert 0 < wrong - right <= INDEPENDENT * np.log((1 - EXCHANGED) / EXCHANGED)
+
+
+def test_image_that_shows_somebody_else_has_bounded_cost_and_no_pull() -> None:
+    scores, pulls = [], []
+    for away_m in (0.5, 1.0, 5.0):
+        spoilt = NOISY.copy()
+        beside = POSE.copy()
+        beside[:2] += away_m
+        spoilt[0] = landmarks_of(RIG, BODY, beside)[0]
+        found = LandmarkCue(RIG, BODY, spoilt)
+        scores.append(found.score(POSE[None])[0])
+        pulls.append(found.normal(POSE[None]))
+        settled = found.score(np.stack([POSE, beside]))
+        assert settled[0] < settled[1]
+    assert scores[2] - scores[0] < 1.0
+    without = NOISY.copy()
+    without[0] = np.nan
+    expected = LandmarkCue(RIG, BODY, without).normal(POSE[None])
+    np.testing.assert_allclose(pulls[2].matrix, expected.matrix, atol=0.2 * np.abs(expected.matrix).max())
+
+
+def test_hidden_landmarks_count_less() -> None:
+    clear, hidden = (
+        LandmarkCue(RIG, BODY, landmarks_of(RIG, BODY, POSE, visibility=visibility)).normal(POSE[None]).matrix[0]
+        for visibility in (1.0, 0.1)
+    )
+    assert np.trace(hidden) < 0.3 * np.trace(clear)
+
+
+# --- proposals and contradictions ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("heading", ["true", "turned"])
+def test_pose_of_the_landmarks_is_proposed(heading: str) -> None:
+    pose = POSE if heading == "true" else TURNED
+    (found,) = propose(RIG, BODY.skeleton, landmarks_of(RIG, BODY, pose, 0.02))
+    assert np.linalg.norm(BODY.skeleton.joints(found) - BODY.skeleton.joints(pose), axis=1).mean() < 0.05
+
+
+def test_few_landmarks_propose_no_pose() -> None:
+    few = np.full(SEEN.shape, np.nan)
+    rows = [LANDMARKS.index(name) for name in JOINT_LANDMARKS[:5]]
+    few[:, rows] = SEEN[:, rows]
+    assert propose(RIG, BODY.skeleton, few).shape == (0, len(POSE))
+    alone = np.full(SEEN.shape, np.nan)
+    alone[0] = SEEN[0]
+    assert propose(RIG, BODY.skeleton, alone).shape == (0, len(POSE))
+
+
+def test_contradicted_joints_get_variance_and_others_none() -> None:
+    assert contradiction(RIG, BODY, POSE, NOISY).max() < 0.03**2
+    raised = POSE.copy()
+    raised[NAMES.index("elbow_l_flexion")] += 2.0
+    variance = contradiction(RIG, BODY, raised, NOISY)
+    assert variance.shape == (len(JOINTS),)
+    wrist = JOINTS.index("wrist_l")
+    off = np.linalg.norm(BODY.skeleton.joints(raised)[wrist] - BODY.skeleton.joints(POSE)[wrist])
+    assert 0.2 * off < np.sqrt(3 * variance[wrist]) < off
+    assert np.delete(variance, wrist).max() < 0.03**2
+    assert not contradiction(RIG, BODY, raised, np.full(SEEN.shape, np.nan)).any()
+
+
+# --- whose landmarks they are -------------------------------------------------------------------------------------
+
+
+MASKS = draw_silhouettes(BODY, RIG, POSE[None])[0]
+
+
+def test_landmarks_of_the_person_in_the_masks_are_chosen() -> None:
+    beside = POSE.copy()
+    beside[:2] += [0.5, 0.4]
+    people = np.stack([landmarks_of(RIG, BODY, beside), SEEN])
+    np.testing.assert_array_equal(of_person(people, MASKS), SEEN)
+    assert of_person(people[:0], MASKS) is None and of_person(None, MASKS) is None
+    far_away = POSE.copy()
+    far_away[:2] += 1.5
+    assert of_person(landmarks_of(RIG, BODY, far_away)[None], MASKS) is None
+
+
+def test_small_skeleton_that_a_network_sees_in_a_head_is_refused() -> None:
+    tiny = SEEN.copy()
+    head = SEEN[:, [LANDMARKS.index("nose")], :2]
+    tiny[..., :2] = head + 0.12 * (SEEN[..., :2] - SEEN[..., :2].mean(axis=1, keepdims=True))
+    assert of_person(tiny[None], MASKS) is None
+
+
+def test_images_without_the_person_have_no_landmarks() -> None:
+    masks = MASKS.copy()
+    masks[1] = 0
+    masks[2] = np.where(masks[2] > 0, OTHERS, 0)
+    found = of_person(SEEN[None], masks)
+    assert found is not None
+    assert np.isnan(found[[1, 2]]).all()
+    np.testing.assert_array_equal(found[[0, 3]], SEEN[[0, 3]])
+    assert of_person(SEEN[None], np.zeros_like(MASKS)) is None
+
+
+def test_half_hidden_person_keeps_the_landmarks() -> None:
+    lower = MASKS.copy()
+    for mask in lower:
+        x, y, width, height = cv2.boundingRect(mask)
+        mask[y + height // 2 :] = 0
+    np.testing.assert_array_equal(of_person(SEEN[None], lower), SEEN)

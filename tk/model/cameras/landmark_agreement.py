@@ -48,6 +48,7 @@ def associated(rig: Rig, landmarks: Float) -> Float:
     result = landmarks.copy()
     for c in range(len(rig)):
         fit = np.array([[_fit(rig, seen, c, other[c]) for other in landmarks] for seen in landmarks])
+        fit = fit.reshape(len(landmarks), len(landmarks))
         free = np.ones(len(landmarks), np.bool_)
         open_to = np.isfinite(fit)
         judged = open_to.any(axis=1)

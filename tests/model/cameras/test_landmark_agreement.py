@@ -1,0 +1,114 @@
+"""Landmarks of several images against each other: evidence for cameras, and whose they are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.model.landmarks import landmarks_of
+from tests.model.ring import ring_of_cameras
+from tests.trackers.walker import BODY, walk
+from tk.model.cameras.camera import Rig
+from tk.model.cameras.landmark_agreement import associated, evidence_for_cameras
+from tk.model.cues.landmarks import log_ratio
+
+RIG = ring_of_cameras(4, 160, 200)
+NETWORK_M = 0.03  # error of a network's landmarks
+POSES = walk(3)
+
+
+def with_turned(rig: Rig, c: int, degrees: float) -> Rig:
+    """Return the rig whose camera c is turned about the vertical axis of its image."""
+    turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    cameras = list(rig)
+    cameras[c] = replace(rig[c], rotation=turn @ rig[c].rotation, translation=turn @ rig[c].translation)
+    return Rig(tuple(cameras))
+
+
+def seen(poses: np.ndarray = POSES, noise_m: float = NETWORK_M) -> list[np.ndarray]:
+    """Return the landmarks (1, C, L, 3) of one person in each frame."""
+    return [landmarks_of(RIG, BODY, pose, noise_m, seed=i)[None] for i, pose in enumerate(poses)]
+
+
+def test_correct_cameras_are_confirmed() -> None:
+    assert (evidence_for_cameras(RIG, seen()) > 3.0).all()
+
+
+@pytest.mark.parametrize("c", [0, 2])
+def test_turned_camera_is_contradicted_and_the_others_are_confirmed(c: int) -> None:
+    evidence = evidence_for_cameras(with_turned(RIG, c, 10.0), seen())
+    assert evidence[c] < -3.0
+    assert (np.delete(evidence, c) > 0).all()
+
+
+def test_frames_of_an_opening_count_as_one() -> None:
+    one = seen(POSES[:1])
+    np.testing.assert_allclose(evidence_for_cameras(RIG, one * 4), evidence_for_cameras(RIG, one))
+
+
+def test_cameras_with_fewer_than_two_others_have_no_evidence() -> None:
+    two = Rig(tuple(RIG)[:2])
+    assert np.isnan(evidence_for_cameras(two, [one[:, :2] for one in seen()])).all()
+    blind = [one.copy() for one in seen()]
+    for one in blind:
+        one[:, 3] = np.nan
+    assert np.isfinite(evidence_for_cameras(RIG, blind)).tolist() == [True, True, True, False]
+    assert np.isnan(evidence_for_cameras(RIG, [np.zeros((0, 4, 21, 3))])).all()
+
+
+def test_ratio_falls_with_the_distance_and_is_bounded() -> None:
+    visible = np.full(21, 0.95)
+    ratios = [log_ratio(np.full(21, metres), visible) for metres in (0.0, 0.03, 0.1, 0.5, 5.0)]
+    assert ratios == sorted(ratios, reverse=True) and ratios[1] > 0 > ratios[3]
+    assert ratios[3] - ratios[4] < 0.1 and np.isfinite(ratios[4])
+
+
+# --- association --------------------------------------------------------------------------------------------------
+
+
+def two_people() -> np.ndarray:
+    """(2, C, L, 3)."""
+    behind = POSES[1].copy()
+    behind[:2] += [0.45, 0.3]
+    return np.stack([landmarks_of(RIG, BODY, pose, 0.02, seed=k) for k, pose in enumerate((POSES[0], behind))])
+
+
+def test_correct_association_is_kept() -> None:
+    people = two_people()
+    np.testing.assert_array_equal(associated(RIG, people), people)
+
+
+def test_sets_that_were_exchanged_in_an_image_are_given_back() -> None:
+    people = two_people()
+    exchanged = people.copy()
+    exchanged[:, 1] = people[::-1, 1]
+    np.testing.assert_array_equal(associated(RIG, exchanged), people)
+
+
+def test_set_that_shows_the_person_in_front_is_taken_from_the_one_behind() -> None:
+    people = two_people()
+    front = people.copy()
+    front[1, 2] = people[0, 2]
+    found = associated(RIG, front)
+    np.testing.assert_array_equal(found[0], people[0])
+    assert np.isnan(found[1, 2]).all()
+    np.testing.assert_array_equal(found[1, [0, 1, 3]], people[1, [0, 1, 3]])
+
+
+def test_set_of_the_person_behind_that_was_taken_for_the_one_in_front_is_moved() -> None:
+    people = two_people()
+    moved = people.copy()
+    moved[0, 2], moved[1, 2] = np.nan, people[0, 2]
+    found = associated(RIG, moved)
+    np.testing.assert_array_equal(found[0], people[0])
+    assert np.isnan(found[1, 2]).all()
+
+
+def test_sets_remain_where_too_few_images_show_the_person() -> None:
+    people = two_people()
+    people[:, 2:] = np.nan
+    np.testing.assert_array_equal(associated(RIG, people), people)
+    assert associated(RIG, people[:0]).shape == (0, 4, 21, 3)
