@@ -32,7 +32,7 @@ from tk.model.cameras.bundle import TrackedPoses
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.refinement import turn_between
 from tk.run import offline as finish
-from tk.run.delays import retimed, whole_delays
+from tk.run.delays import retimed, retimed_landmarks, whole_delays
 from tk.run.refined_calibration import refine_capture
 from tk.run.refinement import BetterCameras
 from tk.settings import Settings
@@ -243,6 +243,18 @@ def test_masks_of_late_cameras_come_from_other_frames() -> None:
         shown = [np.flatnonzero(mask[0]).tolist() for mask in late.get(frame)]
         assert shown == [[frame], [frame - 1] if frame >= 1 else [], [frame + 2] if frame < 2 else []]
     assert retimed(store, np.arange(4), np.zeros(3, np.int64)) is store
+
+
+def test_landmarks_of_late_cameras_come_from_other_frames() -> None:
+    frames = np.array([3, 4, 5, 7])  # frame 6 was not tracked
+    landmarks = np.broadcast_to(frames[:, None, None, None], (4, 3, 2, 3)).astype(np.float64)
+    late = retimed_landmarks(landmarks, frames, np.array([0, 1, -2]))
+    assert late is not None and late.shape == landmarks.shape
+    np.testing.assert_array_equal(late[:, 0, 0, 0], [3, 4, 5, 7])
+    np.testing.assert_array_equal(late[:, 1, 1, 2], [np.nan, 3, 4, np.nan])
+    np.testing.assert_array_equal(late[:, 2, 0, 1], [5, np.nan, 7, np.nan])
+    assert retimed_landmarks(landmarks, frames, np.zeros(3, np.int64)) is landmarks
+    assert retimed_landmarks(None, frames, np.array([0, 1, 0])) is None
 
 
 def test_sigma_is_unknown_from_the_first_frame_with_a_high_residual_on() -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.model.figures import draw_silhouettes
+from tests.model.landmarks import landmarks_of
 from tests.model.ring import ring_of_cameras
 from tk.errors import CaptureError
 from tk.model.body.anthropometry import BodyDimensions
@@ -16,7 +17,7 @@ from tk.model.body.skeleton import JOINTS, shoulder_angles
 from tk.model.setup import Subject
 from tk.optim.gauss_newton import BatchSolution
 from tk.settings import SilhouetteSettings
-from tk.trackers.initialisation import TrajectoryHypothesis, find_person, stature_of
+from tk.trackers.initialisation import EXCHANGE, TrajectoryHypothesis, find_person, stature_of
 from tk.trackers.protocol import Observation
 from tk.trackers.silhouette import SilhouetteTracker
 
@@ -100,7 +101,7 @@ def test_difficult_first_frame_is_reached_by_tracking_back_from_an_easy_one() ->
     assert errors[0] < 0.06 and errors[-1] < 0.04, errors
 
 
-def test_hypothesis_whose_fitted_body_has_the_lower_residual_is_chosen(monkeypatch) -> None:
+def test_hypothesis_whose_fitted_body_has_the_lower_cost_is_chosen(monkeypatch) -> None:
     """The arms change places; with the average body the wrong hypothesis comes first."""
     right = placed(arms(standing_pose(SKELETON), (1, 0.6, 0.3), (0.2, 1, -0.6)), 0.6)
     wrong = placed(arms(standing_pose(SKELETON), (0.2, 1, -0.6), (1, 0.6, 0.3)), 0.6)
@@ -108,16 +109,16 @@ def test_hypothesis_whose_fitted_body_has_the_lower_residual_is_chosen(monkeypat
     frames = [Observation(i, np.zeros(0, np.uint8), m) for i, m in enumerate(masks)]
     tracker = tracker_of()
     hypotheses = [
-        TrajectoryHypothesis(tracker.world.poses_in(np.array([pose] * 4)), residual)
-        for pose, residual in ((wrong, 0.10), (right, 0.105))
+        TrajectoryHypothesis(tracker.world.poses_in(np.array([pose] * 4)), nats)
+        for pose, nats in ((wrong, 20.0), (right, 21.0))
     ]
     monkeypatch.setattr("tk.trackers.contour_finder.find_person", lambda *_: hypotheses)
     pose = tracker.world.poses_out(tracker.find(frames, Subject(STATURE)))
     assert error(SKELETON.joints(pose)[None], right[None])[0] < 0.02
 
 
-def test_poses_with_similar_residuals_in_one_frame_all_become_hypotheses(monkeypatch) -> None:
-    """In the first frame the wrong pose has the lower residual, by little."""
+def test_poses_with_similar_costs_in_one_frame_all_become_hypotheses(monkeypatch) -> None:
+    """In the first frame the wrong pose has the lower cost, by little."""
     right = placed(arms(standing_pose(SKELETON), (1, 0.6, 0.3), (0.2, 1, -0.6)), 0.6)
     wrong = placed(arms(standing_pose(SKELETON), (0.2, 0.3, 1), (-0.3, 1, 0.6)), 0.6)
     masks = draw_silhouettes(BODY, RIG, np.array([right] * 4))
@@ -129,14 +130,13 @@ def test_poses_with_similar_residuals_in_one_frame_all_become_hypotheses(monkeyp
     monkeypatch.setattr("tk.trackers.initialisation.gait.hypotheses", lambda *_: np.array([wrong, right]))
     monkeypatch.setattr("tk.trackers.initialisation.REFINED", 1)
     monkeypatch.setattr("tk.trackers.initialisation._searched", lambda _, __, ___, pose: pose)
-    residuals = {False: 0.21, True: 0.22}
-    monkeypatch.setattr(
-        tracker, "mean_residual", lambda _, poses, __: np.array([residuals[np.allclose(p, right)] for p in poses])
-    )
+    costs = {False: 20.0, True: 20.5}
+    monkeypatch.setattr(tracker, "score", lambda _, poses, __: np.array([costs[np.allclose(p, right)] for p in poses]))
+    monkeypatch.setattr(tracker, "mean_residual", lambda _, poses, __: np.full(len(poses), 0.21))
     monkeypatch.setattr(tracker, "improved", lambda _, __, pose: pose)
     hypotheses = find_person(tracker, frames, [tracker.pyramid(frame) for frame in frames])
-    assert [hypothesis.residual for hypothesis in hypotheses] == pytest.approx([0.21, 0.22])
-    assert hypotheses[0].handicap == 1.0 < hypotheses[1].handicap
+    # the second pose faces the same way, which is improbable from the start
+    assert [hypothesis.cost for hypothesis in hypotheses] == pytest.approx([20.0, 20.5 + EXCHANGE])
     assert error(SKELETON.joints(hypotheses[1].poses[0])[None], right[None])[0] < 1e-6
 
 
@@ -216,3 +216,31 @@ def test_recovered_person_keeps_the_heading_where_silhouettes_are_ambiguous(monk
         assert (np.cos(pose[facing] - yaw) < 0) == turned
         assert error == pytest.approx(0.2 - gain * turned)
     np.testing.assert_array_equal(tracker.recover(pyramid, before, 0.05)[0], before)
+
+
+def test_landmarks_tell_the_heading_that_silhouettes_leave_open() -> None:
+    """The masks show the person in both headings."""
+    facing = placed(standing_pose(SKELETON), 0.6)
+    back = placed(standing_pose(SKELETON), 0.6 + np.pi)
+    tracker = tracker_of()
+    masks = draw_silhouettes(BODY, RIG, np.stack([facing, back])).max(axis=0)
+    for pose in (facing, back):
+        seen = landmarks_of(RIG, BODY, pose, 0.03)[None]
+        frame = Observation(0, np.zeros(0, np.uint8), masks, landmarks=seen)
+        pyramid = tracker.pyramid(frame)
+        assert pyramid.landmarks is not None
+        score = tracker.score(pyramid, tracker.world.poses_in(np.stack([facing, back])))
+        assert (score[0] < score[1]) == (pose is facing)
+
+
+def test_start_with_landmarks_begins_with_their_pose(monkeypatch) -> None:
+    """A pose that no start by silhouettes reaches: seated, arms crossed, seen from behind."""
+    seated = {"hip_l_pitch": -90.0, "hip_r_pitch": -90.0, "knee_l_flexion": 90.0, "knee_r_flexion": 90.0}
+    pose = placed(arms(standing_pose(SKELETON), (1, 0.0, 0.1), (1, 0.0, -0.4)), 2.9, **seated)
+    masks = draw_silhouettes(BODY, RIG, pose[None])[0]
+    tracker = tracker_of()
+    frame = Observation(0, np.zeros(0, np.uint8), masks, landmarks=landmarks_of(RIG, BODY, pose, 0.02)[None])
+    far = placed(standing_pose(SKELETON), 6.0)
+    monkeypatch.setattr("tk.trackers.initialisation.gait.hypotheses", lambda *_: np.array([far]))
+    found = find_person(tracker, [frame], [tracker.pyramid(frame)])[0].poses
+    assert error(tracker.world.points_out(SKELETON.joints(found)), pose[None])[0] < 0.04

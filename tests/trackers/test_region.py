@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tests.model.figures import draw_silhouettes, scaled
+from tests.model.landmarks import landmarks_of
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, EMPTY, NAMES, STATURE, errors, find_again_elsewhere, observe, walk
 from tk.errors import CaptureError
@@ -19,7 +20,6 @@ from tk.model.body.limb_candidates import exchanged, pairs, turned
 from tk.model.body.skeleton import JOINTS, shoulder_angles
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume
-from tk.model.cues.landmarks import ROWS
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.setup import InitPose, Setup, Subject
 from tk.settings import RegionSettings, Settings, SilhouetteSettings
@@ -408,7 +408,7 @@ def test_second_pass_corrects_the_frames_before_a_limb_was_found() -> None:
     tracker, wrist = tracker_at(POSES[0]), JOINTS.index("wrist_l")
 
     def told(lost: np.ndarray) -> np.ndarray:
-        poses, _, sigma = tracker.second_pass(masks, first, lost, np.zeros((6, 3, 2)), None, True)
+        poses, _, sigma = tracker.second_pass(masks, first, lost, np.zeros((6, 3, 2)), None, keep_body=True)
         assert np.isfinite(sigma).all()
         return np.linalg.norm(SKELETON.joints(poses) - SKELETON.joints(raised), axis=-1)[:, wrist]
 
@@ -426,7 +426,9 @@ def test_sigma_is_large_if_two_poses_have_similar_costs() -> None:
     tracker, wrist = tracker_at(POSES[0]), JOINTS.index("wrist_l")
 
     def sigma(masks: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        return tracker.second_pass(masks, poses, np.zeros(3, bool), np.zeros((3, 3, 2)), None, True)[2][:, wrist]
+        return tracker.second_pass(masks, poses, np.zeros(3, bool), np.zeros((3, 3, 2)), None, keep_body=True)[2][
+            :, wrist
+        ]
 
     one, other = draw_silhouettes(BODY, RIG, np.array([hanging[0], raised[0]]))
     found = sigma(np.array([one, half, other]), np.concatenate([hanging[:2], raised[2:]]))
@@ -439,7 +441,7 @@ def test_second_pass_finds_legs_that_were_exchanged_in_most_frames() -> None:
     legs = pairs(tracker.limbs)[1]
     first = np.array([exchanged(pose, [legs])[0] for pose in POSES[:4]] + list(POSES[4:]))
     masks = draw_silhouettes(BODY, RIG, POSES)
-    poses, _, sigma = tracker.second_pass(masks, first, np.zeros(6, bool), np.zeros((6, 3, 2)), None, True)
+    poses, _, sigma = tracker.second_pass(masks, first, np.zeros(6, bool), np.zeros((6, 3, 2)), None, keep_body=True)
     moved = [joint for leg in legs for joint in leg.joints]
     off = np.linalg.norm(SKELETON.joints(poses) - SKELETON.joints(POSES), axis=-1)[:, moved]
     before = np.linalg.norm(SKELETON.joints(first) - SKELETON.joints(POSES), axis=-1)[:, moved]
@@ -488,8 +490,8 @@ def test_legs_that_took_each_other_s_place_are_found_by_the_routine_search() -> 
 
 
 def seen_at(pose: np.ndarray, noise_m: float = 0.03) -> np.ndarray:
-    """The landmarks (1, 12, 3) of a network that is some centimetres off."""
-    return SKELETON.joints(pose)[ROWS][None] + np.random.default_rng(7).normal(0.0, noise_m, (1, 12, 3))
+    """The landmarks (1, C, L, 3) of a network that is some centimetres off."""
+    return landmarks_of(RIG, BODY, pose, noise_m)[None]
 
 
 @pytest.mark.parametrize("wrong", ["turned", "legs"])
@@ -504,14 +506,53 @@ def test_landmarks_correct_left_and_right(wrong: str) -> None:
         assert (errors(found, pose).max() < 2 * CLOSE_M) == right
 
 
-def test_landmarks_that_the_silhouettes_deny_change_nothing() -> None:
-    raised = with_arm(with_arm(POSES[0], "l", (0, 0.2, 1), 0.0), "r", (0, 0.2, 1), 0.0)
+def test_landmarks_pull_a_limb_that_silhouettes_do_not_show() -> None:
+    """The forearm lies in front of the trunk in all images: only the landmarks show the hand."""
+    pose = with_arm(POSES[0], "l", (0.6, 0.1, -1.0), 60.0)
+    masks = draw_silhouettes(BODY, RIG, pose[None])[0]
+    tracker = tracker_at(pose, masks)
+    other = pose.copy()
+    other[NAMES.index("elbow_l_flexion")] += np.radians(15)
+    pull = {}
+    for name, landmarks in (("none", None), ("right", seen_at(pose, 0.0)), ("other", seen_at(other, 0.0))):
+        pyramid = tracker.pyramid(replace(observe(masks), landmarks=landmarks))
+        start = tracker.world.poses_in(pose[None])
+        pull[name] = tracker.settle(pyramid, start).states[0, NAMES.index("elbow_l_flexion")]
+    assert abs(pull["right"] - pose[NAMES.index("elbow_l_flexion")]) < np.radians(6)
+    assert pull["other"] > pull["right"] + np.radians(2)
+
+
+def test_landmarks_that_nobody_is_seen_with_change_nothing() -> None:
+    unseen = np.full_like(seen_at(POSES[0]), np.nan)
+    elsewhere = POSES[0].copy()
+    elsewhere[:2] += 1.2
     found = [
         tracker_at(POSES[0]).step(replace(observe(MASKS[0], 0), landmarks=landmarks))
-        for landmarks in (None, seen_at(raised), seen_at(POSES[0]), np.full((2, 12, 3), np.nan))
+        for landmarks in (None, unseen, seen_at(elsewhere), np.concatenate([unseen, unseen]))
     ]
     for other in found[1:]:
         np.testing.assert_array_equal(other.pose, found[0].pose)
+        assert other.landmarks is None
+
+
+def test_landmarks_that_the_silhouettes_deny_enlarge_sigma_and_do_not_move_the_arms() -> None:
+    raised = with_arm(with_arm(POSES[0], "l", (0, 0.2, 1), 0.0), "r", (0, 0.2, 1), 0.0)
+    plain, denied = (
+        tracker_at(POSES[0]).step(replace(observe(MASKS[0], 0), landmarks=landmarks))
+        for landmarks in (seen_at(POSES[0]), seen_at(raised))
+    )
+    assert errors(denied, POSES[0]).max() < 2 * CLOSE_M
+    assert plain.sigma is not None and denied.sigma is not None
+    for wrist in ("wrist_l", "wrist_r"):
+        assert denied.sigma[JOINTS.index(wrist)] > 0.1 > plain.sigma[JOINTS.index(wrist)]
+
+
+def test_estimate_has_the_landmarks_of_its_person() -> None:
+    beside = POSES[0].copy()
+    beside[:2] += 0.6
+    people = np.concatenate([seen_at(beside), seen_at(POSES[0])])
+    found = tracker_at(POSES[0]).step(replace(observe(MASKS[0], 0), landmarks=people))
+    np.testing.assert_array_equal(found.landmarks, people[1])
 
 
 def test_no_heading_is_doubted_that_landmarks_have_shown() -> None:

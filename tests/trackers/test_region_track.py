@@ -115,10 +115,15 @@ def test_without_the_initialisation_pose_the_body_is_fitted_again(tiny: Path, tm
     assert np.abs(models[0]["parts/shape"] - models[1]["parts/shape"]).max() > 1e-4
 
 
-def test_runs_repeat_bit_for_bit_with_any_seed(tiny: Path, causal: Path, tmp_path: Path) -> None:
+def test_runs_repeat_bit_for_bit(tiny: Path, causal: Path, tmp_path: Path) -> None:
+    run(tiny, tmp_path / "r.h5", frames=(0, 6), causal=True)
+    assert_same(tmp_path / "r.h5", causal, slice(0, 6))
+
+
+def test_another_seed_searches_other_poses_and_finds_the_person_too(tiny: Path, tmp_path: Path) -> None:
     config = settings_file.from_toml(f"seed = 5\n{QUICK}")
     track(open_capture(tiny), tmp_path / "r.h5", config, frames=(0, 6), causal=True)
-    assert_same(tmp_path / "r.h5", causal, slice(0, 6))
+    assert mean_error(read_result(tmp_path / "r.h5"), tiny) < 0.08
 
 
 def test_result_that_contradicts_its_masks_is_suspect_and_ends_with_exit_code_3(

@@ -55,14 +55,14 @@ def spread_over(frames: Sequence[Observation], count: int = _OPENING) -> list[Ob
 def opening_agreement(setup: Setup, frames: Sequence[Observation]) -> Agreement:
     """Return whether the silhouettes of the opening frames agree.
 
-    Masks that contradict the others do not make a camera wrong if a network has made them: they have holes, and pieces
-    of other things. The landmarks that the network saw must contradict the others', too.
+    A network's masks have holes and contain pieces of other things. A camera whose masks contradict the others is right
+    if its landmarks agree with the others'.
     """
     found = MaskAgreement(setup.rig, setup.volume).compare([frame.masks for frame in spread_over(frames)])
     seen = [frame.landmarks for frame in frames if frame.landmarks is not None]
     if not seen or not (found.wrong or found.refusal):
         return found
-    return found.confirmed(~(evidence_for_cameras(setup.rig, seen) < 0))
+    return found.confirmed(evidence_for_cameras(setup.rig, seen))
 
 
 class CameraMonitor:

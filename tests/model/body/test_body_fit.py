@@ -7,6 +7,7 @@ import pytest
 
 from tests.model.figures import BODY as AVERAGE
 from tests.model.figures import draw_silhouettes, scaled, surface_points
+from tests.model.landmarks import body_points
 from tests.model.ring import ring_of_cameras
 from tk.kernels.cones import CONE
 from tk.kernels.line_search import SearchSettings
@@ -18,6 +19,7 @@ from tk.model.body.body_parameters import BodyFamily, shape_rows
 from tk.model.body.cone_body import SHAPE_NUMBERS, build_cone_body
 from tk.model.body.gait_poses import walking_pose
 from tk.model.body.skeleton import SEGMENTS
+from tk.model.cues.landmarks import LANDMARKS
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Views
 
@@ -114,6 +116,17 @@ def test_dimension_rows_equal_finite_differences():
             body = build_cone_body(BodyDimensions(*values)).reshaped(change)
             pair.append(along_rows(body, POSE))
         np.testing.assert_allclose(rows[:, k], (pair[0] - pair[1]) / 2e-5, atol=1e-6, err_msg=name)
+
+
+def test_landmark_rows_equal_finite_differences():
+    mean = FAMILY.mean
+    shared = mean + np.random.default_rng(3).normal(0, 0.02, len(mean)) * (FAMILY.deviation > 1e-5)
+    rows = FAMILY.landmark_rows(shared, FAMILY.build(shared), POSE)
+    assert rows.shape == (len(LANDMARKS), 3, len(mean))
+    for k, step in enumerate(1e-5 * np.eye(len(mean))):
+        pair = [body_points(FAMILY.build(shared + sign * step), POSE) for sign in (1, -1)]
+        np.testing.assert_allclose(rows[..., k], (pair[0] - pair[1]) / 2e-5, atol=1e-5)
+    assert (np.abs(rows).max(axis=(0, 1)) > 0.01)[[DIMENSIONS.index("upper_arm"), DIMENSIONS.index("calf")]].all()
 
 
 def test_rows_use_the_pose_of_their_frame():

@@ -253,6 +253,18 @@ def test_twists_are_derivatives(seed):
         np.testing.assert_array_equal(numeric[~moves], 0)
 
 
+@given(seeds)
+@many
+def test_point_jacobian_equals_finite_differences(seed):
+    rng, pose = np.random.default_rng(seed), random_pose(seed)
+    segment = rng.integers(0, len(SEGMENTS), 6).astype(np.int32)
+    place, h = rng.normal(0, 0.5, (6, 3)), 1e-6
+    found = SKELETON.point_jacobian(pose[None], segment, SKELETON.points(pose[None], segment, place))[0]
+    steps = h * np.eye(D)
+    numeric = (SKELETON.points(pose + steps, segment, place) - SKELETON.points(pose - steps, segment, place)) / (2 * h)
+    np.testing.assert_allclose(found, np.moveaxis(numeric, 0, -1), atol=1e-7)
+
+
 # Anatomy: which way is positive
 
 

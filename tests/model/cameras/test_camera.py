@@ -181,3 +181,16 @@ def test_a_reduced_camera_remembers_the_recorded_image() -> None:
     np.testing.assert_allclose(whole.matrix, odd.matrix, rtol=1e-15)
     np.testing.assert_array_equal(whole.translation, odd.translation + 1)
     assert odd.reduced(1) is odd and odd.recorded() is odd
+
+
+def test_landmarks_in_pixels_of_the_recorded_images_and_back() -> None:
+    rig = Rig((LENSES["barrel"].reduced(2), LENSES["barrel"], LENSES["barrel"].reduced(3)))
+    points = np.random.default_rng(1).uniform(-0.5, 0.5, (7, 3))
+    seen = np.array([np.column_stack([camera.project(points)[0], np.full(7, 0.8)]) for camera in rig])
+    seen[1, 2] = np.nan
+    frames = np.stack([seen, seen + 1.0])
+    recorded = rig.recorded_pixels(frames)
+    for camera, own, known in zip(rig.recorded(), recorded[0], np.isfinite(seen[..., 0]), strict=True):
+        np.testing.assert_allclose(own[known, :2], camera.project(points)[0][known], atol=1e-9)
+    np.testing.assert_allclose(rig.reduced_pixels(recorded), frames, atol=1e-9)
+    np.testing.assert_array_equal(recorded[..., 2], frames[..., 2])

@@ -225,6 +225,6 @@ def test_images_without_the_person_have_no_landmarks() -> None:
 def test_half_hidden_person_keeps_the_landmarks() -> None:
     lower = MASKS.copy()
     for mask in lower:
-        x, y, width, height = cv2.boundingRect(mask)
+        _, y, _, height = cv2.boundingRect(mask)
         mask[y + height // 2 :] = 0
     np.testing.assert_array_equal(of_person(SEEN[None], lower), SEEN)

@@ -272,3 +272,30 @@ def test_empty_mask_in_one_frame_is_ignored(masks: np.ndarray) -> None:
     spoilt[1] = 0
     found = compare(spoilt)
     assert found.closes.tolist() == [True, False, True] and found.wrong == ()
+
+
+NO_EVIDENCE = np.full(5, np.nan)
+
+
+def with_evidence(**nats: float) -> np.ndarray:
+    """Return (5,) evidence for the cameras c0 to c4; the others have none."""
+    return np.array([nats.get(f"c{c}", np.nan) for c in range(5)])
+
+
+def test_camera_that_other_evidence_confirms_is_not_wrong(masks: np.ndarray) -> None:
+    judged = replace(compare(masks), wrong=(1, 3))
+    assert judged.confirmed(with_evidence(c0=4, c1=5, c2=4, c3=6, c4=3)).wrong == ()
+    assert judged.confirmed(with_evidence(c0=4, c1=5, c2=4, c3=-6, c4=3)).wrong == (3,)
+    assert judged.confirmed(with_evidence(c0=4, c1=5, c2=4)).wrong == (3,)  # of c3 the masks alone tell
+    assert judged.confirmed(NO_EVIDENCE).wrong == judged.wrong
+
+
+def test_refusal_stays_unless_other_evidence_denies_it(masks: np.ndarray) -> None:
+    refused = replace(compare(masks), refusal="no three cameras agree")
+    assert refused.confirmed(np.full(5, 4.0)).refusal == ""
+    assert refused.confirmed(with_evidence(c0=4, c1=4, c2=4)).refusal == ""
+    assert refused.confirmed(with_evidence(c0=4, c1=4, c2=-4, c3=4, c4=4)).refusal == refused.refusal
+    assert refused.confirmed(NO_EVIDENCE).refusal == refused.refusal  # as with two cameras
+    one_sided = replace(refused, wrong=(2,))
+    assert one_sided.confirmed(with_evidence(c0=4, c1=4, c2=-4, c3=4, c4=4)).refusal == refused.refusal
+    assert one_sided.confirmed(np.full(5, 4.0)).refusal == ""

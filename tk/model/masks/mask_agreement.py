@@ -84,11 +84,16 @@ class Agreement:
     extent_m: float
     reductions: tuple[int, ...]
 
-    def confirmed(self, cameras: Bool) -> Agreement:
-        """Return the agreement without contradictions of cameras (C,) that other evidence confirms."""
-        wrong = tuple(c for c in self.wrong if not cameras[c])
-        refusal = "" if np.count_nonzero(~cameras) <= len(wrong) else self.refusal
-        return replace(self, wrong=wrong, refusal=refusal)
+    def confirmed(self, evidence: Float) -> Agreement:
+        """Return the agreement without contradictions that other evidence denies.
+
+        Args:
+            evidence: (C,) logarithm of the likelihood ratio of each camera being right, nats; NaN if there is none. The
+                masks' verdict about a camera stays without evidence.
+        """
+        wrong = tuple(c for c in self.wrong if not evidence[c] > 0)
+        denied = not wrong and (evidence > 0).any() and not (evidence < 0).any()
+        return replace(self, wrong=wrong, refusal="" if denied else self.refusal)
 
     @property
     def disagreement(self) -> float:
