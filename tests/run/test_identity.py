@@ -17,7 +17,7 @@ from tk.io.results.status import Status
 from tk.kernels.line_search import COLOR_BINS
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
-from tk.model.cues.part_colors import PartColors
+from tk.model.cues.part_colors import LearnedColors, PartColors
 from tk.run.identity import (
     EXCHANGED,
     KEPT,
@@ -32,7 +32,7 @@ from tk.run.identity import (
 )
 
 AT = np.zeros((2, 3))
-LEARNED = {"colors": np.ones((2, 3))}
+LEARNED = LearnedColors(np.ones((2, 3)), np.ones(3))
 
 
 @pytest.fixture(scope="module")
@@ -53,11 +53,9 @@ def meet(contacts: Contacts, distances: list[float]) -> list[Contact]:
 def test_contact_lasts_from_the_approach_to_the_departure() -> None:
     contacts = Contacts()
     assert meet(contacts, [2.0, 0.9, 0.4, 0.6]) == []
-    again = Contacts()
-    again.restore(contacts.state())  # as after --resume
-    (ended,) = again.update(14, {0: np.zeros(3), 1: np.ones(3)}, {0: LEARNED, 1: LEARNED})
+    (ended,) = contacts.update(14, {0: np.zeros(3), 1: np.ones(3)}, {0: LEARNED, 1: LEARNED})
     assert (ended.people, ended.first, ended.moment, ended.last) == ((0, 1), 11, 12, 14)
-    np.testing.assert_array_equal(ended.learned[1]["colors"], LEARNED["colors"])
+    np.testing.assert_array_equal(ended.learned[1].counts, LEARNED.counts)
 
 
 def test_exchange_is_likeliest_where_it_makes_the_steps_shortest() -> None:
@@ -70,7 +68,7 @@ def test_exchange_is_likeliest_where_it_makes_the_steps_shortest() -> None:
 
 def test_people_of_unknown_colours_have_no_contact() -> None:
     contacts = Contacts()
-    assert contacts.update(0, {0: np.zeros(3), 1: np.zeros(3)}, {0: {}, 1: LEARNED}) == [] and not contacts.all
+    assert contacts.update(0, {0: np.zeros(3), 1: np.zeros(3)}, {0: None, 1: LEARNED}) == [] and not contacts.all
 
 
 @pytest.mark.parametrize(

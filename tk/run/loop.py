@@ -15,13 +15,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from tk.errors import CaptureError, ResultError, TkError
 from tk.io.captures.mask_store import MaskStores
+from tk.io.results.codec import decode, encode
 from tk.io.results.data import HullPoints, Value
 from tk.io.results.reader import as_damage_error, read_result
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
 from tk.run.member import Tracked
 from tk.run.offline import REFINED
-from tk.run.people import People
+from tk.run.people import People, PeopleState
 from tk.run.plan import Plan
 from tk.run.prefetch import Observed
 from tk.threads import one_thread
@@ -178,7 +179,7 @@ class Loop:
 
     def _restore(self, output: Output) -> None:
         with as_damage_error(output.writer.path, "the state of the run"):
-            self.people.restore(output.writer.models, output.writer.state)
+            self.people.resume(output.writer.models, decode(PeopleState, output.writer.state))
 
     def _step_through(self, observations: Iterator[Observed]) -> Iterator[tuple[Estimate, ...]]:
         """Step the trackers to the end; estimates are yielded when they are in the file."""
@@ -263,7 +264,7 @@ class Loop:
 
     def _state(self, output: Output) -> Mapping[str, Value]:
         origin = {_ORIGIN + name: value for name, value in output.origin.items()}
-        return {**self.people.state(), **origin}
+        return {**encode(self.people.state()), **origin}
 
 
 def _fill(taken: list[Observed], observations: Iterator[Observed], count: int) -> Iterator[Observed]:

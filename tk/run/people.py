@@ -14,7 +14,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
@@ -32,7 +32,7 @@ from tk.model.people import LocatedPerson, PeopleFinder, order_people
 from tk.model.setup import Subject
 from tk.run.choice import chosen, matched, unknown
 from tk.run.identity import EXCHANGED, UNCLEAR, Contact, Contacts, outcome_of
-from tk.run.member import Member, Tracked, below
+from tk.run.member import Member, MemberState, Tracked
 from tk.run.task import Task
 from tk.trackers.camera_monitor import CameraMonitor, spread_over
 from tk.trackers.protocol import Estimate, Observation, Tracker, sharing
@@ -59,10 +59,33 @@ _UNEXPLAINED = 0.25
 # colours and body: -0.1 to -0.7 for the same person, -1.6 to -3.7 for the other one.
 _SAME_COLORS = -1.1
 
-_PEOPLE = "people/"
-_SUBJECT, _IN_INIT_POSE = "subject", "in_init_pose"  # the number of the subject, -1: unknown
-_NUMBER, _GIVEN = "number", "given"
-_MODEL, _CONTACTS = "body/", "contacts/"
+
+@dataclass(frozen=True)
+class PersonState:
+    """A person who is tracked.
+
+    Attributes:
+        number: see :class:`~tk.run.member.Member`.
+        subject: number of the subject; None: nothing is known of the person.
+        in_init_pose: whether the subject began in the initialisation pose.
+        body: of a person who is not in the result; None of others.
+        member: what changes from frame to frame.
+    """
+
+    number: int
+    subject: int | None
+    in_init_pose: bool
+    body: dict[str, Any] | None
+    member: MemberState
+
+
+@dataclass(frozen=True)
+class PeopleState:
+    """The people who are tracked, the numbers of those who have had a tracker, and the contacts."""
+
+    tracked: list[PersonState]
+    given: list[int]
+    contacts: list[Contact]
 
 
 class People:
@@ -337,10 +360,10 @@ class People:
             contact.outcome = outcome_of(likeness, contact.shorter_m)
             _LOG.debug("contact of %s, frames %d to %d: %s", contact.people, contact.first, contact.last, likeness)
             if contact.outcome == EXCHANGED:
-                states = [member.state() for member in pair]
+                states = [member.state for member in pair]
                 for member, state, colors in zip(pair, states[::-1], contact.learned, strict=True):
-                    member.sharing.rewind({**state, **colors})
-                    member.restore(state)
+                    tracker: Any = state.tracker
+                    member.state = replace(state, tracker=replace(tracker, colors=colors))
             contact.learned = ()
 
     # --- who enters and leaves ----------------------------------------------------------------------------------------
@@ -467,41 +490,39 @@ class People:
             return [*self.members[0].monitor.report(), *missing]
         return [*(f"person {m.number}: {line}" for m in self.members for line in m.monitor.report()), *missing]
 
-    def state(self) -> dict[str, Any]:
-        """Return what :meth:`restore` needs beside the bodies. Person 0's entries have no prefix."""
-        state: dict[str, Any] = {}
-        for k, member in enumerate(self._tracked):
-            prefix = f"{_PEOPLE}{k}/" if k else ""
-            number = next((k for k, known in enumerate(self._setup.subjects) if known is member.subject), -1)
-            known = {_SUBJECT: number, _IN_INIT_POSE: member.subject.in_init_pose, _NUMBER: member.number}
-            own = {**member.state(), **known}
-            state |= {prefix + name: value for name, value in own.items()}
-            if not member.written:
-                state |= {f"{prefix}{_MODEL}{name}": value for name, value in member.tracker.model().items()}
-        state[_GIVEN] = np.array(sorted(self._given or ()), np.int64)
-        return state | {_CONTACTS + name: value for name, value in self._contacts.state().items()}
+    def state(self) -> PeopleState:
+        """Return what :meth:`resume` needs."""
+        subjects = self._setup.subjects
+        tracked = [
+            PersonState(
+                number=member.number,
+                subject=next((k for k, known in enumerate(subjects) if known is member.subject), None),
+                in_init_pose=member.subject.in_init_pose,
+                body=None if member.written else dict(member.tracker.model()),
+                member=member.state,
+            )
+            for member in self._tracked
+        ]
+        return PeopleState(tracked, sorted(self._given or ()), self._contacts.all)
 
-    def restore(self, models: Sequence[Mapping[str, Any]], state: Mapping[str, Any]) -> None:
+    def resume(self, models: Sequence[Mapping[str, Any]], state: PeopleState) -> None:
         """Continue a run. Earlier frames are not stored, so a person who has just entered may be tracked later.
 
         Args:
             models: bodies of the people in the result.
             state: of :meth:`state`.
         """
-        k = 0
-        while own := below(f"{_PEOPLE}{k}/", state) if k else state:
-            subject, in_init_pose = int(own[_SUBJECT]), bool(own[_IN_INIT_POSE])
-            if subject >= 0 and self._setup.subjects[subject].in_init_pose and not in_init_pose:
-                self._begin_in_any_pose(subject)
-            known = self._setup.subjects[subject] if subject >= 0 else Subject(in_init_pose=in_init_pose)
-            tracker, number = self._make() if k else self._first, int(own[_NUMBER])
-            member = self._member(number, known, tracker, written=number < len(models))
-            self._tracked[k:] = [member]
-            tracker.restore(models[number] if member.written else below(_MODEL, own), own)
-            member.restore(own)
-            k += 1
-        self._given = {int(number) for number in state[_GIVEN]}
-        self._contacts.restore(below(_CONTACTS, state))
+        self._tracked = []
+        for person in state.tracked:
+            k, subjects = person.subject, self._setup.subjects
+            if k is not None and subjects[k].in_init_pose and not person.in_init_pose:
+                self._begin_in_any_pose(k)
+            known = Subject(in_init_pose=person.in_init_pose) if k is None else self._setup.subjects[k]
+            member = self._member(person.number, known, self._new_tracker(), written=person.body is None)
+            member.tracker.take_model(models[person.number] if person.body is None else person.body)
+            member.state = person.member
+            self._tracked.append(member)
+        self._given, self._contacts.all = set(state.given), state.contacts
 
 
 def _not_entered(number: int) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ if TYPE_CHECKING:  # the process that decodes and segments needs no parts of a t
     from tk.model.body.cone_body import ConeBody
     from tk.model.cameras.camera import Rig
     from tk.model.cameras.tracker_frame import TrackerFrame
-    from tk.model.cues.part_colors import RenderedBody
+    from tk.model.cues.part_colors import LearnedColors, RenderedBody
     from tk.model.cues.ray_costs import RayGrid
     from tk.model.hull.hull import HullSurface
     from tk.model.masks.silhouettes import Views
@@ -95,9 +95,10 @@ class Estimate:
 
 
 class Tracker(Protocol):
-    """Tracks one subject from frame to frame. Poses are those of the setup's world, except in :meth:`state`.
+    """Tracks one subject from frame to frame. Poses are those of the setup's world, except in :attr:`state`.
 
     Attributes:
+        State, state: a frozen dataclass, and what changes from frame to frame, see :class:`tk.model.stateful.Stateful`.
         method: name in :data:`tk.trackers.registry.METHODS`.
         stages, timing_stages: names of the entries of ``Estimate.iterations``, and of ``Estimate.timing``.
         pose_names, pose_units: (D,) names and units of the entries of the pose vector.
@@ -110,6 +111,8 @@ class Tracker(Protocol):
         tracks_among_others: whether it is a :class:`SharingTracker`. A visual hull needs whole masks.
     """
 
+    State: ClassVar[type[Any]]
+    state: Any
     method: str
     stages: tuple[str, ...]
     timing_stages: tuple[str, ...]
@@ -135,7 +138,7 @@ class Tracker(Protocol):
 
     @property
     def body(self) -> ConeBody:
-        """The subject's body; only after :meth:`start` or :meth:`restore`."""
+        """The subject's body; only after :meth:`start` or :meth:`take_model`."""
         ...
 
     def prepare(self) -> None:
@@ -159,12 +162,8 @@ class Tracker(Protocol):
         """Return the fitted body, for `/model` of the result."""
         ...
 
-    def state(self) -> Mapping[str, Any]:
-        """Return everything that changes from frame to frame."""
-        ...
-
-    def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
-        """Continue where a run with this model and state stopped."""
+    def take_model(self, model: Mapping[str, Any]) -> None:
+        """Take the body of a run; the caller then sets the state."""
         ...
 
 
@@ -187,23 +186,17 @@ class SharingTracker(Tracker, Protocol):
         """Return the poses (D,) of the last frame and of the frame before, in the tracker's frame."""
         ...
 
-    def learned(self) -> Mapping[str, Any]:
-        """Return the learned colours, a part of the state; empty before any are known."""
+    def learned(self) -> LearnedColors | None:
+        """Return the learned colours, the field ``colors`` of the state; None before any are known."""
         ...
 
-    def likeness(
-        self, frame: Observation, learned: Mapping[str, Any] | None = None, pose: Float | None = None
-    ) -> float:
+    def likeness(self, frame: Observation, learned: LearnedColors | None = None, pose: Float | None = None) -> float:
         """Return the log-likelihood, mean per pixel, that a frame shows this person: by the colours, and by the body if
         a pose (D,) is given."""
         ...
 
     def lose(self) -> None:
         """Take the last frame for lost: the person is searched for in the next one."""
-        ...
-
-    def rewind(self, state: Mapping[str, Any]) -> None:
-        """Go back to a state."""
         ...
 
 

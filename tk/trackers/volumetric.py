@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,7 @@ from tk.model.cues.edge_term import ContourTerm
 from tk.model.cues.objective import NEAR_M, BodyObjective, Fit, FrameObjective
 from tk.model.hull.hull import HullSurface, VisualHull
 from tk.model.setup import Setup, Subject
+from tk.model.stateful import Stateful
 from tk.optim import schedule
 from tk.optim.smd import MAX_ITERATIONS
 from tk.settings import Settings
@@ -64,7 +66,19 @@ def points_and_iterations(effort: float) -> tuple[int, int]:
     return max(round(effort), 1), max(round(min(effort, 1.0) * MAX_ITERATIONS), 1)
 
 
-class VolumetricTracker:
+@dataclass(frozen=True)
+class VolumetricState:
+    """(D,) poses of the last frame and of the one before; consecutive frames in which the person was lost; whether no
+    frame has been tracked yet; colours."""
+
+    pose: Float
+    previous: Float
+    lost_for: int
+    fresh: bool
+    appearance: Appearance
+
+
+class VolumetricTracker(Stateful[VolumetricState]):
     """Tracks one person. :meth:`start` once, then :meth:`step` for every frame, the first included.
 
     Args:
@@ -77,6 +91,7 @@ class VolumetricTracker:
         VolumeError: no two cameras see the volume.
     """
 
+    State = VolumetricState
     method = "volumetric"
     stages: tuple[str, ...] = ("all", *CHAINS)
     timing_stages: tuple[str, ...] = ("hull", "surface", "colour", "optimise", "update")
@@ -303,25 +318,7 @@ class VolumetricTracker:
             "patches/known": self._appearance.known.astype(np.uint8),
         }
 
-    def state(self) -> Mapping[str, Any]:
-        """Return the values that :meth:`restore` needs, beside the model, to continue after the last frame."""
-        return {
-            "pose": self._pose,
-            "previous": self._previous,
-            "lost_for": self._lost_for,
-            "mean_yuv": self._appearance.mean,
-        }
-
-    def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
-        """Continue a run that stopped with this model and state."""
+    def take_model(self, model: Mapping[str, Any]) -> None:
+        """Take the body of a run."""
         self._finder.take_body(restore_body(model))
         self._build()
-        self._appearance = Appearance(
-            np.asarray(state["mean_yuv"]),
-            np.asarray(model["patches/deviation_yuv"]),
-            np.asarray(model["patches/known"]).astype(bool),
-        )
-        self._pose = np.asarray(state["pose"])
-        self._previous = np.asarray(state["previous"])
-        self._lost_for = int(state["lost_for"])
-        self._fresh = False
