@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import tk
 from tests.conftest import QUICK, Silent, refused
 from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, STATURE, walk
-from tk.errors import CaptureError
+from tk.errors import CaptureError, ConfigError
 from tk.io import settings_file
 from tk.io.captures.frames import FrameSet
 from tk.io.results.data import Result
@@ -87,6 +88,18 @@ def test_a_source_in_memory_is_tracked() -> None:
     assert [e.time for e in found] == [LATENCY_S + i / SETUP.fps for i in (1, 2, 3)]  # the source's clock
     for estimate, pose in zip(found, POSES[1:], strict=False):
         assert np.linalg.norm(estimate.joints - BODY.skeleton.joints(pose), axis=1).mean() < 0.03
+
+
+def test_the_public_interface_tracks_a_source(tmp_path: Path) -> None:
+    assert isinstance(ONE, tk.Source)
+    found = list(tk.track(ONE, setup=SETUP, config=SETTINGS, frames=(0, 2)))
+    assert [e.frame for e in found] == [0, 1]
+    result = tk.track(ONE, tmp_path / "r.h5", setup=SETUP, config=SETTINGS, causal=True, frames=(0, 2))
+    np.testing.assert_array_equal(result.joints, [e.joints for e in found])
+    with refused(ConfigError, "rendered", "setup"):
+        tk.track(ONE, config=SETTINGS)
+    with refused(ConfigError, "body", "only with a capture"):
+        tk.track(ONE, setup=SETUP, body="body.toml")
 
 
 def test_a_source_of_unknown_length_is_written_until_it_ends(tmp_path: Path) -> None:
