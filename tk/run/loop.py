@@ -26,7 +26,7 @@ from tk.run.people import People, PeopleState
 from tk.run.plan import Plan
 from tk.run.prefetch import Observed
 from tk.threads import one_thread
-from tk.trackers.protocol import Estimate, Observation, shows_person, two_pass
+from tk.trackers.protocol import Estimate, Frame, shows_person, two_pass
 
 _LOG = logging.getLogger(__name__)
 
@@ -227,7 +227,7 @@ class Loop:
         self.tracked += len(self._held)
         self._held.clear()
 
-    def _step(self, observation: Observation) -> tuple[Estimate, ...] | None:
+    def _step(self, observation: Frame) -> tuple[Estimate, ...] | None:
         """Step all trackers; return the estimates of the people who are present, None before the first frame to be
         written."""
         with one_thread():

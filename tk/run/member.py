@@ -13,7 +13,7 @@ from tk.model.cameras.camera import Rig
 from tk.model.setup import Subject
 from tk.model.stateful import Stateful
 from tk.trackers.camera_monitor import CameraMonitor, MonitorState
-from tk.trackers.protocol import Estimate, Observation, SharingTracker, Tracker, sharing, without_cameras
+from tk.trackers.protocol import Estimate, Frame, SharingTracker, Tracker, sharing, without_cameras
 from tk.trackers.registry import TrackerState
 from tk.trackers.sharing import UNKNOWN
 
@@ -30,8 +30,8 @@ class Tracked:
     and what its tracker used."""
 
     estimate: Estimate
-    share: Observation
-    used: Observation
+    share: Frame
+    used: Frame
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Member(Stateful[MemberState]):
         assert tracker is not None
         return tracker
 
-    def step(self, share: Observation) -> Tracked:
+    def step(self, share: Frame) -> Tracked:
         """Return the answer for this person's share of the next frame."""
         estimate, used = self.monitor.step(share)
         self.lost = estimate.status == "lost"

@@ -35,7 +35,7 @@ from tk.run.identity import EXCHANGED, UNCLEAR, Contact, Contacts, outcome_of
 from tk.run.member import Member, MemberState, Tracked
 from tk.run.task import Task
 from tk.trackers.camera_monitor import CameraMonitor, spread_over
-from tk.trackers.protocol import Estimate, Observation, Tracker, sharing
+from tk.trackers.protocol import Estimate, Frame, Tracker, sharing
 from tk.trackers.sharing import UNKNOWN_BY_HULLS, PixelOwners, assign, cast_points
 
 _LOG = logging.getLogger(__name__)
@@ -103,7 +103,7 @@ class People:
         self._tracked: list[Member] = []
         self._contacts = Contacts()
         self._every = max(1, round(LOOK_EVERY_S * task.setup.fps))
-        self._unknown: deque[Observation] = deque(maxlen=_HISTORY)  # people who are unknown, in the last frames
+        self._unknown: deque[Frame] = deque(maxlen=_HISTORY)  # people who are unknown, in the last frames
         self._refused = 0  # consecutive people who could not be tracked
         self._admit_from = 0  # the frame from which on another may be
         # numbers, as `tk inspect` prints them, of the people who have had a tracker; None before the first frame
@@ -149,7 +149,7 @@ class People:
 
     # --- the first frames ---------------------------------------------------------------------------------------------
 
-    def start(self, opening: Sequence[Observation], given_masks: bool = False) -> bool:
+    def start(self, opening: Sequence[Frame], given_masks: bool = False) -> bool:
         """Find the people in the first frame, and start a tracker for everybody in the volume.
 
         Masks that were made from the images belong to them; ``given_masks`` are compared with them.
@@ -209,7 +209,7 @@ class People:
         self._setup = replace(self._setup, subjects=tuple(subjects))
 
     def _start(
-        self, opening: Sequence[Observation], found: Sequence[LocatedPerson], numbers: Sequence[int], alone: bool
+        self, opening: Sequence[Frame], found: Sequence[LocatedPerson], numbers: Sequence[int], alone: bool
     ) -> None:
         """Start the trackers of the people found in the first frame. ``numbers``: of those chosen; ``alone``: the hulls
         show one person at most."""
@@ -243,7 +243,7 @@ class People:
         return self._make() if self._tracked else self._first
 
     def _begin(
-        self, member: Member, frames: Sequence[Observation], hull_m: float | None, whole: Sequence[Observation] = ()
+        self, member: Member, frames: Sequence[Frame], hull_m: float | None, whole: Sequence[Frame] = ()
     ) -> None:
         """Start a tracker.
 
@@ -261,11 +261,11 @@ class People:
     def _finder(self) -> PeopleFinder:
         return PeopleFinder(self._setup.rig, self._setup.volume, self._setup.up)
 
-    def _several_in(self, opening: Sequence[Observation]) -> bool:
+    def _several_in(self, opening: Sequence[Frame]) -> bool:
         """Return whether several people are found in some frame of the opening."""
         return any(len(self._finder.find(f.masks, f.uncertain)) > 1 for f in spread_over(opening, _TESTED))
 
-    def _shares(self, people: Sequence[LocatedPerson], frames: Sequence[Observation]) -> list[list[Observation]]:
+    def _shares(self, people: Sequence[LocatedPerson], frames: Sequence[Frame]) -> list[list[Frame]]:
         """Return the observations of each person in consecutive frames, by hulls that are carved again in each.
 
         A person's observations end where the hull grows or shrinks as no body does: there it shows a part of somebody
@@ -280,7 +280,7 @@ class People:
         places = [person.position for person in people]
         counts = [len(person.points) for person in people]
         hulls = [cast_points(rig, grid, person.points, person.voxel_m) for person in people]
-        shares: list[list[Observation]] = [[] for _ in people]
+        shares: list[list[Frame]] = [[] for _ in people]
         at_first: list[int] = []  # voxels of each hull in the second frame: in the first, all masks carved it
         mixed = [False] * len(people)
         for frame in frames:
@@ -301,7 +301,7 @@ class People:
 
     # --- one frame ----------------------------------------------------------------------------------------------------
 
-    def step(self, frame: Observation) -> dict[int, Tracked]:
+    def step(self, frame: Frame) -> dict[int, Tracked]:
         """Return the answers of the people in the result who are tracked, by number.
 
         Before that person is tracked, a result of one person has the status absent, or lost if the first person in the
@@ -326,7 +326,7 @@ class People:
                 answers[member.number] = replace(answer, estimate=replace(answer.estimate, status="absent"))
         return {m.number: answers[m.number] for m in self.members} or self._nobody(frame, "absent")
 
-    def _step_all(self, frame: Observation) -> tuple[dict[int, Tracked], PixelOwners]:
+    def _step_all(self, frame: Frame) -> tuple[dict[int, Tracked], PixelOwners]:
         """Return the answers of all members, and the owners of the pixels at the poses that were expected."""
         owners = self._owners(frame, ahead=True)
         answers = {
@@ -335,7 +335,7 @@ class People:
         }
         return answers, owners
 
-    def _owners(self, frame: Observation, ahead: bool = False) -> PixelOwners:
+    def _owners(self, frame: Frame, ahead: bool = False) -> PixelOwners:
         """Return the owners of a frame's pixels, in the order of the members, by their bodies at the last pose, or at
         the pose expected in the next frame if ``ahead``."""
         assert self._grid is not None
@@ -368,7 +368,7 @@ class People:
 
     # --- who enters and leaves ----------------------------------------------------------------------------------------
 
-    def _look(self, frame: Observation, owners: PixelOwners | None) -> dict[int, Tracked]:
+    def _look(self, frame: Frame, owners: PixelOwners | None) -> dict[int, Tracked]:
         """Find people who enter or leave, and return the answers of those who enter.
 
         ``owners``: of the frame's pixels; None if the only person got all.
@@ -425,7 +425,7 @@ class People:
         self._begin_in_any_pose(number)
         return self._setup.subjects[number]
 
-    def _newcomers(self, frame: Observation, owners: PixelOwners) -> list[LocatedPerson]:
+    def _newcomers(self, frame: Frame, owners: PixelOwners) -> list[LocatedPerson]:
         """Return the people in the working volume whom the pixels show that no body explains."""
         *areas, unexplained = owners.areas(frame.masks)
         person = max((float(np.median(area)) for area in areas), default=0.0)
@@ -434,9 +434,7 @@ class People:
         masks = owners.unknown(frame).masks
         return [p for p in self._finder.find(masks >= PERSON, hidden=masks == OTHERS) if p.inside]
 
-    def _admit(
-        self, frames: Sequence[Observation], person: LocatedPerson, subject: Subject, written: bool
-    ) -> Member | None:
+    def _admit(self, frames: Sequence[Frame], person: LocatedPerson, subject: Subject, written: bool) -> Member | None:
         """Add a person who is tracked from the first of some frames on; None if nobody can be tracked."""
         # people who are not written have higher numbers than all who are, now and later
         higher = len(self._choice) if isinstance(self._choice, tuple) else 1
@@ -458,7 +456,7 @@ class People:
         self._refused += 1
         self._admit_from = frame + self._every * min(2 ** (self._refused - 1), _LONGEST_PAUSE)
 
-    def _nobody(self, frame: Observation, status: str) -> dict[int, Tracked]:
+    def _nobody(self, frame: Frame, status: str) -> dict[int, Tracked]:
         """Return the answers in a frame before somebody who is in the result is tracked."""
         return {} if self.several else {0: Tracked(replace(self._no_pose, status=status), frame, frame)}
 

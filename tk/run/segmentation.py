@@ -24,15 +24,14 @@ class Labels(NamedTuple):
     """The masks of a frame set.
 
     Attributes:
-        masks, uncertain: as an :class:`~tk.trackers.protocol.Observation` has them.
-        sources: (C,) uint8, where a segmenter's masks come from, see :mod:`tk.run.learned_masks`; None for others.
-        landmarks: as an :class:`~tk.trackers.protocol.Observation` has them.
+        masks, uncertain, sources, landmarks, view_landmarks: as a :class:`~tk.trackers.protocol.Frame` has them.
     """
 
     masks: NDArray[np.uint8]
     uncertain: NDArray[np.bool_] | None = None
     sources: NDArray[np.uint8] | None = None
     landmarks: NDArray[np.float64] | None = None
+    view_landmarks: NDArray[np.float32] | None = None
 
 
 Labeller = Callable[[FrameSet], Labels]

@@ -25,7 +25,7 @@ from tk.model.masks.image_health import MOVED, HealthState, ImageHealth, describ
 from tk.model.masks.mask_agreement import Agreement, MaskAgreement
 from tk.model.setup import Setup, Subject
 from tk.model.stateful import Stateful
-from tk.trackers.protocol import Estimate, Observation, Tracker, sharing, shows_person, without_cameras
+from tk.trackers.protocol import Estimate, Frame, Tracker, sharing, shows_person, without_cameras
 from tk.trackers.region import RegionTracker
 from tk.trackers.residual import RATE
 from tk.trackers.residual_judge import JudgeState, ResidualJudge
@@ -44,12 +44,12 @@ Span = tuple[int, int, int]
 """Frames: the first, the last, and their number."""
 
 
-def spread_over(frames: Sequence[Observation], count: int = _OPENING) -> list[Observation]:
+def spread_over(frames: Sequence[Frame], count: int = _OPENING) -> list[Frame]:
     """Return this many of the opening's frames, spread over it."""
     return [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))]
 
 
-def opening_agreement(setup: Setup, frames: Sequence[Observation]) -> Agreement:
+def opening_agreement(setup: Setup, frames: Sequence[Frame]) -> Agreement:
     """Return whether the silhouettes of the opening frames agree."""
     return MaskAgreement(setup.rig, setup.volume).compare([frame.masks for frame in spread_over(frames)])
 
@@ -106,7 +106,7 @@ class CameraMonitor(Stateful[MonitorState]):
         self._was_lost = False
         self._excess = 0.0  # of this frame, mean over the cameras used; 0 if it was not tested
 
-    def start(self, frames: Sequence[Observation], whole: Sequence[Observation] = ()) -> list[Observation]:
+    def start(self, frames: Sequence[Frame], whole: Sequence[Frame] = ()) -> list[Frame]:
         """Return the opening frames without the cameras that are wrong, for the tracker's start.
 
         Args:
@@ -150,7 +150,7 @@ class CameraMonitor(Stateful[MonitorState]):
         if self._subject.height_m is None:
             check_stature(self.tracker.body.dimensions.stature)
 
-    def step(self, frame: Observation) -> tuple[Estimate, Observation]:
+    def step(self, frame: Frame) -> tuple[Estimate, Frame]:
         """Return the estimate for the next frame, and the observation without the excluded cameras."""
         unhealthy = self._health.look(frame.images, frame.masks, self._excluded)
         self.unfit = bad = self._bad(unhealthy)
@@ -181,7 +181,7 @@ class CameraMonitor(Stateful[MonitorState]):
         """Return (C,) the cameras whose image excludes them. Trackers of hulls need all cameras."""
         return np.array([self.tracker.can_exclude_cameras and reason is not None for reason in unhealthy])
 
-    def _plausible(self, index: int, estimate: Estimate, used: Observation) -> Estimate:
+    def _plausible(self, index: int, estimate: Estimate, used: Frame) -> Estimate:
         """Return the estimate, with status lost if it is impossible."""
         if estimate.status == "lost":
             self._plausibility.forget()

@@ -19,7 +19,7 @@ from tk.model.setup import Subject
 from tk.model.stateful import Stateful
 from tk.trackers.contour_finder import ContourFinder
 from tk.trackers.initialisation import HEADINGS, PHASES, centroid
-from tk.trackers.protocol import Estimate, Observation
+from tk.trackers.protocol import Estimate, Frame
 
 Float = NDArray[np.float64]
 S = TypeVar("S")
@@ -54,11 +54,11 @@ class ContourTracker(ContourFinder, Stateful[S], ABC):
     _lost_for: int  # consecutive frames, up to the last one, in which the person was lost
 
     @abstractmethod
-    def start(self, frames: Sequence[Observation], subject: Subject) -> None:
+    def start(self, frames: Sequence[Frame], subject: Subject) -> None:
         """Find the subject in the first frame and fit the body to all of them, see :meth:`ContourFinder.find`."""
 
     @abstractmethod
-    def step(self, frame: Observation) -> Estimate:
+    def step(self, frame: Frame) -> Estimate:
         """Return the estimate for the next frame."""
 
     @abstractmethod
@@ -85,7 +85,7 @@ class ContourTracker(ContourFinder, Stateful[S], ABC):
         """Return the learned colours, a part of the state; None before any are known."""
         return self.colors.state if self.colors.known else None
 
-    def likeness(self, frame: Observation, learned: LearnedColors | None = None, pose: Float | None = None) -> float:
+    def likeness(self, frame: Frame, learned: LearnedColors | None = None, pose: Float | None = None) -> float:
         """Return the log-likelihood, mean per pixel, that a frame shows this person; about 0 or less.
 
         Args:

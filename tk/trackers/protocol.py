@@ -27,8 +27,8 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Observation:
-    """Images and masks of all cameras at one time, for one subject.
+class Frame:
+    """One time index: images, masks and landmarks of all cameras, for one subject.
 
     Attributes:
         index: number of the frame in its source.
@@ -41,6 +41,8 @@ class Observation:
         sources: (C,) uint8, where a segmenter's masks come from, see :mod:`tk.run.learned_masks`; None for others.
         landmarks: (N, 12, 3) m, joints of all people in view by a segmenter's network, see
             :mod:`tk.model.cues.landmarks`; NaN where they are unknown. None if no network saw this frame.
+        view_landmarks: (C, L, 3) float32, x and y in pixels and visibility of a network's landmarks in each view; NaN
+            where the network was not asked. None if it was not asked at all.
     """
 
     index: int
@@ -50,6 +52,10 @@ class Observation:
     time: float = 0.0
     sources: NDArray[np.uint8] | None = None
     landmarks: NDArray[np.float64] | None = None
+    view_landmarks: NDArray[np.float32] | None = None
+
+
+Observation = Frame  # its former name, in modules that are changed at the moment
 
 
 @dataclass(frozen=True)
@@ -72,7 +78,7 @@ class Estimate:
         masks: (C, H, W) uint8, what the tracker took for the person, cleaned; None where that is the observation's, and
             in what :func:`tk.track` hands out. drawn: (C, h, w) bool, where the body is on the tracker's grid of rays,
             cameras left out included; None likewise.
-        mask_source: (C,) uint8, as ``Observation.sources``.
+        mask_source: (C,) uint8, as ``Frame.sources``.
         frame, time: the frame's number in the capture, and seconds; whoever steps the tracker knows them.
         person: the person's number in the run.
     """
@@ -145,7 +151,7 @@ class Tracker(Protocol):
         """Compile kernels while there is nothing else to do."""
         ...
 
-    def start(self, frames: Sequence[Observation], subject: Subject) -> None:
+    def start(self, frames: Sequence[Frame], subject: Subject) -> None:
         """Find the subject in the first of ``frames`` and fit the body. The first :meth:`step` is for that frame, too.
 
         Args:
@@ -154,7 +160,7 @@ class Tracker(Protocol):
         """
         ...
 
-    def step(self, frame: Observation) -> Estimate:
+    def step(self, frame: Frame) -> Estimate:
         """Estimate the pose in the next frame."""
         ...
 
@@ -168,7 +174,7 @@ class Tracker(Protocol):
 
 
 class SharingTracker(Tracker, Protocol):
-    """A tracker that does without the pixels of other people, see :class:`Observation`.
+    """A tracker that does without the pixels of other people, see :class:`Frame`.
 
     Attributes:
         choice: the grid on which its body is rendered.
@@ -190,7 +196,7 @@ class SharingTracker(Tracker, Protocol):
         """Return the learned colours, the field ``colors`` of the state; None before any are known."""
         ...
 
-    def likeness(self, frame: Observation, learned: LearnedColors | None = None, pose: Float | None = None) -> float:
+    def likeness(self, frame: Frame, learned: LearnedColors | None = None, pose: Float | None = None) -> float:
         """Return the log-likelihood, mean per pixel, that a frame shows this person: by the colours, and by the body if
         a pose (D,) is given."""
         ...
@@ -211,7 +217,7 @@ class TwoPassTracker(Tracker, Protocol):
         """Return masks (C, H, W) without specks and small holes, as :meth:`second_pass` takes them."""
         ...
 
-    def without_foreign(self, frame: Observation) -> Observation:
+    def without_foreign(self, frame: Frame) -> Frame:
         """Return the frame without things in its masks that are not the person."""
         ...
 
@@ -282,7 +288,7 @@ def shows_person(masks: NDArray[np.uint8]) -> NDArray[np.bool_]:
     return np.asarray(masks.reshape(len(masks), -1).max(axis=1) >= PERSON)
 
 
-def without_cameras(frame: Observation, out: NDArray[np.bool_]) -> Observation:
+def without_cameras(frame: Frame, out: NDArray[np.bool_]) -> Frame:
     """Return the frame with empty masks in some cameras (C,)."""
     if not out.any():
         return frame

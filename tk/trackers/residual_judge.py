@@ -23,7 +23,7 @@ from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import determine_depth
 from tk.model.cues.ray_costs import residual_of
 from tk.model.stateful import Stateful
-from tk.trackers.protocol import Estimate, Observation, shows_person, without_cameras
+from tk.trackers.protocol import Estimate, Frame, shows_person, without_cameras
 from tk.trackers.region import RegionTracker
 from tk.trackers.residual import OUTLIER, RECENT, contradicted
 
@@ -83,9 +83,7 @@ class ResidualJudge(Stateful[JudgeState]):
         self._at_test = np.zeros(C)
         self._recent = np.full((RECENT, C, 2), np.nan)
 
-    def step(
-        self, frame: Observation, used: Observation, bad: Bool, excluded: Bool
-    ) -> tuple[Estimate, Observation, float]:
+    def step(self, frame: Frame, used: Frame, bad: Bool, excluded: Bool) -> tuple[Estimate, Frame, float]:
         """Step the tracker; exclude a camera that is wrong, and include those again that are right.
 
         Args:
@@ -157,7 +155,7 @@ class ResidualJudge(Stateful[JudgeState]):
         surplus = many and baseline.excess(error)[camera] > OUTLIER and relief > 1.0
         return bool(missing or surplus or error[camera] > _UNRELATED)
 
-    def _residual(self, frame: Observation, estimate: Estimate) -> Float:
+    def _residual(self, frame: Frame, estimate: Estimate) -> Float:
         """Return (C, 2) missing and surplus area at the estimate's pose, of excluded cameras, too. Missing area on
         uncertain pixels is not counted if enough of the mask is left. NaN where a camera sees nobody, or no body was
         fitted.

@@ -23,7 +23,7 @@ from tk.optim.gauss_newton import GaussNewtonSettings
 from tk.settings import Settings, SilhouetteSettings
 from tk.trackers.contour_finder import LINE_SEARCH, SOLVER
 from tk.trackers.contour_tracker import RECOVER_EVERY, ContourTracker
-from tk.trackers.protocol import Estimate, Observation, Stopwatch
+from tk.trackers.protocol import Estimate, Frame, Stopwatch
 
 Float = NDArray[np.float64]
 
@@ -66,12 +66,12 @@ class SilhouetteTracker(ContourTracker[SilhouetteState]):
         self._lost_for = 0
         self._fresh = True
 
-    def start(self, frames: Sequence[Observation], subject: Subject) -> None:
+    def start(self, frames: Sequence[Frame], subject: Subject) -> None:
         self._pose = self._previous = self.find([_blind(f) for f in frames], subject)
         self._lost_for = 0
         self._fresh = True
 
-    def step(self, frame: Observation) -> Estimate:
+    def step(self, frame: Frame) -> Estimate:
         watch = Stopwatch()
         config = self.contours
         pyramid = self.pyramid(frame)
@@ -108,6 +108,6 @@ class SilhouetteTracker(ContourTracker[SilhouetteState]):
         return self._pose, self._previous
 
 
-def _blind(frame: Observation) -> Observation:
+def _blind(frame: Frame) -> Frame:
     """Return the frame without images: this tracker does not use colours."""
     return replace(frame, images=frame.images[:0])

@@ -41,7 +41,7 @@ from tk.optim import schedule
 from tk.optim.smd import MAX_ITERATIONS
 from tk.settings import Settings
 from tk.trackers.contour_finder import ContourFinder
-from tk.trackers.protocol import Estimate, Observation, Stopwatch
+from tk.trackers.protocol import Estimate, Frame, Stopwatch
 
 Float = NDArray[np.float64]
 
@@ -130,14 +130,14 @@ class VolumetricTracker(Stateful[VolumetricState]):
         """Compile the kernels of the initialisation ahead of its first frame."""
         self._finder.prepare()
 
-    def start(self, frames: Sequence[Observation], subject: Subject) -> None:
+    def start(self, frames: Sequence[Frame], subject: Subject) -> None:
         """Find the subject in the first frame and fit the body to all frames, see :meth:`ContourFinder.find`.
 
         Raises:
             CaptureError: the volume is empty.
         """
         # without images: colours inside the silhouettes are a cue of the region tracker only
-        blind = [Observation(f.index, f.images[:0], f.masks) for f in frames]
+        blind = [Frame(f.index, f.images[:0], f.masks) for f in frames]
         pose = self._finder.find(blind, subject)
         first = frames[0]
         self.hull.update(first.masks)
@@ -163,7 +163,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
 
     # --- tracking (section 6.4) ---------------------------------------------------------------------------------
 
-    def step(self, frame: Observation) -> Estimate:
+    def step(self, frame: Frame) -> Estimate:
         """Track the next frame."""
         watch = Stopwatch()
         config = self.config
@@ -216,7 +216,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
         return schedule.optimise(problem, starts, self.iterations)
 
     def _search_limbs(
-        self, frame: Observation, problem: FrameObjective, found: schedule.ScheduleResult
+        self, frame: Frame, problem: FrameObjective, found: schedule.ScheduleResult
     ) -> schedule.ScheduleResult:
         """Search other poses of the limbs by contours; return the result from there if its objective is lower.
 
@@ -224,7 +224,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
         """
         finder = self._finder
         # without images: colours inside the silhouettes are a cue of the region tracker only
-        blind = Observation(frame.index, frame.images[:0], frame.masks, frame.uncertain)
+        blind = Frame(frame.index, frame.images[:0], frame.masks, frame.uncertain)
         pyramid = finder.pyramid(blind)
         converged = finder.settle(pyramid, self._to_contours(found.pose)[None]).states[0]
         candidates, _ = finder.search(blind, pyramid, finder.evidence(finder.screen, blind, pyramid), converged)
@@ -277,7 +277,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
         chain = 1 + CHAIN_OF_SEGMENT[self.skin.segment[fit.frame.even[0]]]
         return bool((np.bincount(chain, fit.unmatched) > LOST_SHARE * np.bincount(chain)).any())
 
-    def _nothing_seen(self, frame: Observation, surface: HullSurface, watch: Stopwatch) -> Estimate:
+    def _nothing_seen(self, frame: Frame, surface: HullSurface, watch: Stopwatch) -> Estimate:
         """Return the last pose with status "lost": the volume is empty."""
         self._previous = self._pose
         self._lost_for += 1
