@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -25,8 +23,8 @@ from tk.run.identity import (
     Contact,
     Contacts,
     doubtful,
-    exchange_masks,
     exchanged,
+    exchanged_masks,
     outcome_of,
     report,
 )
@@ -121,6 +119,9 @@ def test_masks_are_exchanged_too(tmp_path: Path) -> None:
     for frame in range(4):
         for n, store in enumerate(stores):
             store.put(frame, np.full((2, 3, 4), 255 * n, np.uint8))
-    exchange_masks(cast(Any, SimpleNamespace(moment=1, last=2)), stores)
-    assert [int(stores[0].get(frame).max()) for frame in range(4)] == [0, 255, 255, 0]
-    assert [int(stores[1].get(frame).max()) for frame in range(4)] == [255, 0, 0, 255]
+    contact = Contact((0, 1), 1, 2, 1, AT, outcome=EXCHANGED)
+    for _ in range(2):  # an interrupted run is finished again: the stores stay as they are
+        mine, others = (exchanged_masks(n, [contact], dict(enumerate(stores)), np.arange(4)) for n in (0, 1))
+        assert [int(mine.get(frame).max()) for frame in range(4)] == [0, 255, 255, 0]
+        assert [int(others.get(frame).max()) for frame in range(4)] == [255, 0, 0, 255]
+    assert exchanged_masks(0, [], dict(enumerate(stores)), np.arange(4)) is stores[0]

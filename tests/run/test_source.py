@@ -224,7 +224,7 @@ def test_two_people_are_tracked_and_kept_apart(pair: tuple[Result, ...]) -> None
     assert not any((r.status == Status.LOST).any() for r in pair)
 
 
-def test_a_run_stopped_among_the_frames_and_between_two_people_s_second_passes_is_finished(
+def test_a_run_stopped_among_the_frames_and_among_the_second_passes_is_finished(
     pair: tuple[Result, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Stop(Silent):
@@ -232,10 +232,10 @@ def test_a_run_stopped_among_the_frames_and_between_two_people_s_second_passes_i
             if frame == 2:
                 raise KeyboardInterrupt
 
-    def stop_at_person_1(finisher: Any, member: Member, *rest: Any) -> None:
+    def stop_at_person_1(finisher: Any, member: Member, *rest: Any) -> Any:
         if member.number == 1:
             raise KeyboardInterrupt
-        finish_one(finisher, member, *rest)
+        return finish_one(finisher, member, *rest)
 
     def track(reporter: Silent, resume: bool = True) -> tuple[Result, ...]:
         run = task(PAIR, Rendered(MASKS.max(axis=0)), frames=(0, COUNT), people="all")
@@ -248,10 +248,9 @@ def test_a_run_stopped_among_the_frames_and_between_two_people_s_second_passes_i
     with monkeypatch.context() as patch:
         patch.setattr(offline._Finisher, "finish", stop_at_person_1)
         stopped = track(Silent())
-    assert stopped[0].smoothed is not None and stopped[1].smoothed is None
-    np.testing.assert_array_equal(stopped[0].pose, pair[0].pose)
+    assert stopped[0].smoothed is None and stopped[1].smoothed is None, "the file is rewritten once, at the end"
     for a, b in zip(track(Silent()), pair, strict=True):
-        np.testing.assert_allclose(a.pose, b.pose, atol=1e-9)  # the file has rounded rotations of the cameras
+        np.testing.assert_array_equal(a.pose, b.pose)
         np.testing.assert_array_equal(a.status, b.status)
         assert a.smoothed is not None
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.captures.mask_store import MaskStore
+from tk.io.captures.mask_store import MaskStore, MaskStores
 from tk.io.results.data import Result
 from tk.io.results.status import Status
 from tk.model.cues.part_colors import LearnedColors
@@ -149,14 +149,24 @@ def report(contacts: Sequence[Contact]) -> list[str]:
     return lines
 
 
-def exchange_masks(contact: Contact, masks: Sequence[MaskStore]) -> None:
-    """Exchange the masks of two people in the frames that :func:`exchanged` exchanges."""
-    one, other = masks
-    for frame in range(contact.moment, contact.last + 1):
-        if frame in one and frame in other:
-            of_one, of_other = one.get(frame), other.get(frame)
-            one.put(frame, of_other)
-            other.put(frame, of_one)
+def exchanged_masks(
+    person: int, contacts: Sequence[Contact], masks: MaskStores | Mapping[int, MaskStore], frames: NDArray[np.int64]
+) -> MaskStore:
+    """Return a person's masks of frames (F,), those that :func:`exchanged` exchanges taken from the other person; the
+    stores stay as they are."""
+    mixed = [c for c in contacts if c.outcome == EXCHANGED]
+    if not any(person in contact.people for contact in mixed):
+        return masks[person]
+    result = MaskStore()
+    for frame in frames.tolist():
+        owner = {n: n for contact in mixed for n in contact.people}
+        for contact in mixed:
+            a, b = contact.people
+            if contact.moment <= frame <= contact.last and frame in masks[a] and frame in masks[b]:
+                owner[a], owner[b] = owner[b], owner[a]
+        if frame in masks[owner[person]]:
+            result.put(frame, masks[owner[person]].get(frame))
+    return result
 
 
 def _with_rows(to: Result, rows: NDArray[np.int64], source: Result, other: NDArray[np.int64]) -> Result:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Container, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -80,7 +80,6 @@ class Loop:
     Attributes:
         tracked: number of frames, even if the run is interrupted.
         people: who is tracked.
-        finished: the people whose result an earlier run has finished.
     """
 
     def __init__(
@@ -93,7 +92,6 @@ class Loop:
         self.plan, self.output, self.masks, self._note = plan, output, masks, note
         self.tracked = 0
         self._held: list[dict[int, dict[str, ArrayLike]]] = []  # rows of frames that are not in the file yet
-        self.finished: Container[int] = ()
         self.people = People(plan.task, plan.tracker, note)
 
     def frames(self) -> Iterator[tuple[Estimate, ...]]:
@@ -166,12 +164,8 @@ class Loop:
         if output is None or not output.done or not tracker.has_segments:
             return False
         one_pass = self.plan.task.options.causal or not tracker.has_second_pass
-        self.finished = {
-            person
-            for person, (model, result) in enumerate(zip(output.writer.models, read_result(path).people, strict=True))
-            if result.smoothed is not None and (one_pass or REFINED in model)
-        }
-        if len(self.finished) == len(output.writer.models):
+        results = zip(output.writer.models, read_result(path).people, strict=True)
+        if all(r.smoothed is not None and (one_pass or REFINED in model) for model, r in results):
             return False
         output.check()
         self._restore(output)

@@ -137,6 +137,11 @@ class People:
         return found
 
     @property
+    def has_segments(self) -> bool:
+        """Whether segments, angles and a smoothed copy follow from the poses."""
+        return self._first.has_segments
+
+    @property
     def several(self) -> bool:
         """Whether the result may have several people: each then has rows only for frames in which the person is
         present."""
