@@ -118,7 +118,7 @@ def test_python_examples_compile(page: Path) -> None:
 
 
 def test_settings_example_is_accepted() -> None:
-    config = settings_file.from_toml(toml_block("segmentation ="))
+    config = settings_file.from_toml(toml_block("effort ="))
     assert config != Settings() and config.voxels == 128 and not config.volumetric.colors
 
 

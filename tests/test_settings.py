@@ -53,12 +53,9 @@ def test_defaults_round_trip() -> None:
     weight=st.floats(0, 1000, allow_subnormal=False),
     effort=st.floats(0.05, 20),
     colors=st.booleans(),
-    segmentation=st.sampled_from(["collinearity", "mog2"]),
 )
-def test_values_round_trip(
-    voxels: int, seed: int, segmentation: str, weight: float, effort: float, colors: bool
-) -> None:
-    config = Settings(voxels=voxels, seed=seed, segmentation=segmentation, effort=effort)
+def test_values_round_trip(voxels: int, seed: int, weight: float, effort: float, colors: bool) -> None:
+    config = Settings(voxels=voxels, seed=seed, effort=effort)
     config = dataclasses.replace(config, volumetric=VolumetricSettings(colors=colors, edge_weight=weight))
     assert settings_file.from_toml(settings_file.to_toml(config)) == config
 
@@ -83,8 +80,7 @@ def test_settings_missing_in_a_file_keep_their_default() -> None:
         ("[silhouette]\nprediction = true", ["silhouette.prediction", "float"]),
         ("[volumetric]\ncolors = 1", ["volumetric.colors", "bool"]),
         ("volumetric = 3", ["volumetric", "table"]),
-        ("segmentation = 1", ["segmentation", "str"]),
-        ('segmentation = "magic"', ["magic", "collinearity", "mog2"]),
+        ('segmentation = "mog2"', ["segmentation"]),
         ("voxels = 2", ["voxels = 2", "8 to 512"]),
         ("seed = -1", ["seed = -1"]),
         ("[silhouette]\nprediction = 7.0", ["prediction = 7.0"]),
@@ -187,7 +183,7 @@ def test_the_annotated_settings_are_the_settings(config: Settings) -> None:
         if equals and not line.startswith("#"):
             assert lines[number - 1].startswith("# "), name  # each is explained
     assert all(len(line) <= 120 for line in lines)
-    for default in ("Default: 64", 'Default: "collinearity"', "Default: true"):
+    for default in ("Default: 64", "Default: true"):
         assert default in text
 
 

@@ -16,11 +16,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from tk.api import open_capture, track
+    from tk.io.captures.source import Source
     from tk.io.results.data import Result
     from tk.io.results.reader import read_result
     from tk.io.settings_file import read as read_settings
     from tk.model.body.cone_body import ConeBody as Body
     from tk.model.hull.hull import VisualHull
+    from tk.model.setup import Setup
+    from tk.run.task import Task
     from tk.settings import Settings
     from tk.trackers.protocol import Estimate
 
@@ -31,6 +34,9 @@ __all__ = [
     "Estimate",
     "Result",
     "Settings",
+    "Setup",
+    "Source",
+    "Task",
     "VisualHull",
     "__version__",
     "open_capture",
@@ -42,6 +48,9 @@ __all__ = [
 _HOMES = {
     "Body": ("tk.model.body.cone_body", "ConeBody"),
     "Settings": ("tk.settings", "Settings"),
+    "Setup": ("tk.model.setup", "Setup"),
+    "Source": ("tk.io.captures.source", "Source"),
+    "Task": ("tk.run.task", "Task"),
     "Estimate": ("tk.trackers.protocol", "Estimate"),
     "Result": ("tk.io.results.data", "Result"),
     "VisualHull": ("tk.model.hull.hull", "VisualHull"),

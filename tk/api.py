@@ -12,13 +12,15 @@ from typing import TYPE_CHECKING, TypedDict, overload
 
 from tk.errors import ConfigError
 from tk.io.captures.capture import Capture
+from tk.io.captures.source import Source
 from tk.io.importers import open_recording
 from tk.io.results.data import Result
 from tk.io.results.reader import read_result
+from tk.model.setup import Setup
 from tk.run import session
 from tk.run.plan import recording_task
 from tk.run.reporter import Silent
-from tk.run.task import RecordingOptions, parse_choice
+from tk.run.task import RecordingOptions, Task, parse_choice
 from tk.segmenters import Segmenter
 from tk.settings import Settings
 from tk.trackers.protocol import Estimate
@@ -61,6 +63,7 @@ def open_capture(
 class _Options(TypedDict, total=False):
     """Options of :func:`track`, except capture and output."""
 
+    setup: Setup | None
     method: str
     frames: tuple[int, int | None]
     config: Settings | None
@@ -75,17 +78,20 @@ class _Options(TypedDict, total=False):
 
 
 @overload
-def track(capture: Capture | PathLike, output: None = None, **options: Unpack[_Options]) -> Iterator[Estimate]: ...
+def track(
+    capture: Capture | Source | PathLike, output: None = None, **options: Unpack[_Options]
+) -> Iterator[Estimate]: ...
 
 
 @overload
-def track(capture: Capture | PathLike, output: PathLike, **options: Unpack[_Options]) -> Result: ...
+def track(capture: Capture | Source | PathLike, output: PathLike, **options: Unpack[_Options]) -> Result: ...
 
 
 def track(
-    capture: Capture | PathLike,
+    capture: Capture | Source | PathLike,
     output: PathLike | None = None,
     *,
+    setup: Setup | None = None,
     method: str = "region",
     frames: tuple[int, int | None] = (0, None),
     config: Settings | None = None,
@@ -101,14 +107,15 @@ def track(
     """Track one or several people in a capture.
 
     Args:
-        capture: of :func:`open_capture`, or the path of one.
+        capture: of :func:`open_capture`, or the path of one, or another source of images.
         output: a result file to write; without one the estimates are returned frame by frame.
+        setup: cameras, working volume, upward direction, rate and subjects of another source; a capture has its own.
         method: "region", "silhouette" or "volumetric".
         frames: range of frames to return, end exclusive (None: to the last frame).
         config: all settings; the defaults if None.
         seed: seed of the random generator, instead of the one in ``config``.
-        init_pose: a file with a rough initial pose, or a folder of 2D keypoints.
-        body: a result or a TOML file whose body is taken.
+        init_pose: a file with a rough initial pose, or a folder of 2D keypoints; only with a capture.
+        body: a result or a TOML file whose body is taken; only with a capture.
         people: "auto" (one person: the nearest to the initial pose if one is given, else the first that
             :func:`tk.model.people.order_people` returns), "all", or numbers in that order, then in that of entering.
         segmenter: makes the masks, unless the capture has some, instead of the empty scene or an installed segmenter.
@@ -145,16 +152,38 @@ def track(
         init_pose=Path(init_pose) if init_pose is not None else None,
         body=Path(body) if body is not None else None,
     )
-    if not isinstance(capture, Capture):
+    if setup is None and isinstance(capture, str | os.PathLike):
         capture = open_capture(capture, resample=settings.resample)
-    if segmenter is not None:
+    if segmenter is not None and isinstance(capture, Capture):
         capture = replace(capture, segmenter=segmenter)
     reporter = _Logged()
-    if output is None:
-        if resume or force:
-            raise ConfigError("resume and force need an output file")
-        return session.estimates(recording_task(capture, options), reporter.note)
-    summary = session.track(capture, Path(output), options, reporter, resume, force)
+    if output is None and (resume or force):
+        raise ConfigError("resume and force need an output file")
+    if isinstance(capture, Capture):
+        if setup is not None:
+            raise ConfigError("setup: a capture has its own")
+        if output is None:
+            return session.estimates(recording_task(capture, options), reporter.note)
+        summary = session.track(capture, Path(output), options, reporter, resume, force)
+    else:
+        task = _source_task(capture, setup, options, segmenter)
+        if output is None:
+            return session.estimates(task, reporter.note)
+        summary = session.track_task(task, Path(output), reporter, resume, force)
     if summary.interrupted:
         raise KeyboardInterrupt
     return read_result(Path(output))
+
+
+def _source_task(
+    source: Source | PathLike, setup: Setup | None, options: RecordingOptions, segmenter: Segmenter | None
+) -> Task:
+    """Return the task of tracking a source that is no capture."""
+    if isinstance(source, str | os.PathLike):
+        raise ConfigError("setup: a capture has its own")
+    if setup is None:
+        raise ConfigError(f"{source.where}: a source needs a setup: its cameras, working volume, up and rate")
+    for name, given in (("init_pose", options.init_pose), ("body", options.body), ("segmenter", segmenter)):
+        if given is not None:
+            raise ConfigError(f"{name}: only with a capture; the setup or the source of your own holds it")
+    return Task(setup, source, options)

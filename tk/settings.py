@@ -11,8 +11,6 @@ from typing import Any
 
 from tk.errors import ConfigError
 
-SEGMENTATIONS = ("collinearity", "mog2")
-
 #: largest count in a settings file: frames, points, iterations
 MOST_COUNT = 100_000
 #: largest weight, ratio or threshold. Beside it the other terms, whose defaults are 0.1 to 3, no longer count.
@@ -29,7 +27,7 @@ def _check(table: str, values: Any, **ranges: tuple[float, float]) -> None:
 
 @dataclass(frozen=True)
 class ForegroundSettings:
-    """Masks made against the empty scene, with segmentation = "collinearity".
+    """Masks made against the empty scene.
 
     Attributes:
         threshold: least difference between a person's pixel and the scene, in noise variances; pure noise gives 0.5. A
@@ -121,7 +119,6 @@ class Settings:
     Attributes:
         voxels: voxels along the working volume's longest side (the paper: 64 and 128).
         seed: seed of the random numbers: candidate poses of the limb search, and the volumetric tracker's samples.
-        segmentation: "collinearity" (the paper's) or "mog2".
         ahead: frames that a separate process decodes and segments ahead of the tracker; 0: no such process, each frame
             is prepared when the tracker asks for it. The result is the same.
         effort: how much the volumetric tracker computes. 1: the paper's numbers of iterations and points (6.4). A
@@ -137,7 +134,6 @@ class Settings:
 
     voxels: int = 64
     seed: int = 0
-    segmentation: str = "collinearity"
     ahead: int = 4
     effort: float = 1.0
     refine: bool = True
@@ -153,8 +149,6 @@ class Settings:
             raise ConfigError(f"voxels = {self.voxels}: choose from 8 to 512")
         if not 0 <= self.seed < 2**63:  # the result file stores it as an int64
             raise ConfigError(f"seed = {self.seed}: choose from 0 to {2**63 - 1}")
-        if self.segmentation not in SEGMENTATIONS:
-            raise ConfigError(f'segmentation = "{self.segmentation}": choose one of {", ".join(SEGMENTATIONS)}')
         if not 0 <= self.ahead <= 64:
             raise ConfigError(f"ahead = {self.ahead}: choose from 0 to 64 frames")
         if not 0 <= self.person_pixels <= MOST_COUNT:

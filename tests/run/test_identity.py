@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -17,7 +15,7 @@ from tk.io.results.status import Status
 from tk.kernels.line_search import COLOR_BINS
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
-from tk.model.cues.part_colors import PartColors
+from tk.model.cues.part_colors import LearnedColors, PartColors
 from tk.run.identity import (
     EXCHANGED,
     KEPT,
@@ -25,14 +23,14 @@ from tk.run.identity import (
     Contact,
     Contacts,
     doubtful,
-    exchange_masks,
     exchanged,
+    exchanged_masks,
     outcome_of,
     report,
 )
 
 AT = np.zeros((2, 3))
-LEARNED = {"colors": np.ones((2, 3))}
+LEARNED = LearnedColors(np.ones((2, 3)), np.ones(3))
 
 
 @pytest.fixture(scope="module")
@@ -53,11 +51,9 @@ def meet(contacts: Contacts, distances: list[float]) -> list[Contact]:
 def test_contact_lasts_from_the_approach_to_the_departure() -> None:
     contacts = Contacts()
     assert meet(contacts, [2.0, 0.9, 0.4, 0.6]) == []
-    again = Contacts()
-    again.restore(contacts.state())  # as after --resume
-    (ended,) = again.update(14, {0: np.zeros(3), 1: np.ones(3)}, {0: LEARNED, 1: LEARNED})
+    (ended,) = contacts.update(14, {0: np.zeros(3), 1: np.ones(3)}, {0: LEARNED, 1: LEARNED})
     assert (ended.people, ended.first, ended.moment, ended.last) == ((0, 1), 11, 12, 14)
-    np.testing.assert_array_equal(ended.learned[1]["colors"], LEARNED["colors"])
+    np.testing.assert_array_equal(ended.learned[1].counts, LEARNED.counts)
 
 
 def test_exchange_is_likeliest_where_it_makes_the_steps_shortest() -> None:
@@ -70,7 +66,7 @@ def test_exchange_is_likeliest_where_it_makes_the_steps_shortest() -> None:
 
 def test_people_of_unknown_colours_have_no_contact() -> None:
     contacts = Contacts()
-    assert contacts.update(0, {0: np.zeros(3), 1: np.zeros(3)}, {0: {}, 1: LEARNED}) == [] and not contacts.all
+    assert contacts.update(0, {0: np.zeros(3), 1: np.zeros(3)}, {0: None, 1: LEARNED}) == [] and not contacts.all
 
 
 @pytest.mark.parametrize(
@@ -123,6 +119,9 @@ def test_masks_are_exchanged_too(tmp_path: Path) -> None:
     for frame in range(4):
         for n, store in enumerate(stores):
             store.put(frame, np.full((2, 3, 4), 255 * n, np.uint8))
-    exchange_masks(cast(Any, SimpleNamespace(moment=1, last=2)), stores)
-    assert [int(stores[0].get(frame).max()) for frame in range(4)] == [0, 255, 255, 0]
-    assert [int(stores[1].get(frame).max()) for frame in range(4)] == [255, 0, 0, 255]
+    contact = Contact((0, 1), 1, 2, 1, AT, outcome=EXCHANGED)
+    for _ in range(2):  # an interrupted run is finished again: the stores stay as they are
+        mine, others = (exchanged_masks(n, [contact], dict(enumerate(stores)), np.arange(4)) for n in (0, 1))
+        assert [int(mine.get(frame).max()) for frame in range(4)] == [0, 255, 255, 0]
+        assert [int(others.get(frame).max()) for frame in range(4)] == [255, 0, 0, 255]
+    assert exchanged_masks(0, [], dict(enumerate(stores)), np.arange(4)) is stores[0]

@@ -280,7 +280,7 @@ def judged(displacement: list[float], sigma: float = 0.01, blind: int = 0) -> tu
     draft = finish._Draft(result, np.zeros(F, np.bool_), np.zeros(F, np.bool_), columns)
     cameras: Any = SimpleNamespace(rig=ring_of_cameras(4, 160, 120))
     task: Any = SimpleNamespace(settings=Settings())
-    finish._Finisher(Path(), task, True, notes.append, lambda _: None, cameras)._judge(draft, True)
+    finish._Finisher(task, True, notes.append, lambda _: None, cameras)._judge(draft, True)
     return draft, notes
 
 

@@ -341,9 +341,9 @@ def test_requested_frames_are_tracked(tiny: Path) -> None:
     assert choose_frames(late, (0, 6), notes.append) == (5, 6)
 
 
-@pytest.mark.parametrize(("method", "segmentation"), [("region", "collinearity"), ("volumetric", "mog2")])
-def test_masks_are_made_from_the_videos(tiny: Path, tmp_path: Path, method: str, segmentation: str) -> None:
-    config, path = settings_file.from_toml(f'segmentation = "{segmentation}"\n{FITTED}'), tmp_path / "r.h5"
+@pytest.mark.parametrize("method", ["region", "volumetric"])
+def test_masks_are_made_from_the_videos(tiny: Path, tmp_path: Path, method: str) -> None:
+    config, path = settings_file.from_toml(FITTED), tmp_path / "r.h5"
     capture = open_capture(tiny, masks="none")
     assert conftest.track(capture, path, config, method=method, frames=(0, 4)).lost == 0
     found, truth = read_result(path), read_joints(tiny / "truth.h5").positions[:4]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,12 +15,13 @@ from tests.conftest import FITTED, FRAMES
 from tk.errors import CaptureError
 from tk.io import settings_file
 from tk.io.captures.capture import Capture, open_capture
+from tk.io.results.codec import decode, encode
 from tk.io.results.reader import read_joints
 from tk.model.body.joint_sigma import VIEW_M
 from tk.model.cameras.common_view import LEAST_INFORMATION, depth_information
 from tk.model.masks.mask_agreement import Agreement
 from tk.model.setup import Subject
-from tk.trackers.camera_monitor import CameraMonitor
+from tk.trackers.camera_monitor import CameraMonitor, MonitorState
 from tk.trackers.protocol import Estimate, Observation
 from tk.trackers.region import RegionTracker
 
@@ -39,14 +40,15 @@ class Scene:
         self.truth = read_joints(folder / "truth.h5").positions
         tracker = self._tracker()
         tracker.start(self.frames[: tracker.opening_frames], Subject(self.capture.subject_height_m))
-        self.model, self.state = tracker.model(), tracker.state()
+        self.model, self.state = tracker.model(), tracker.state
 
     def _tracker(self) -> RegionTracker:
         return RegionTracker(self.capture.rig, self.capture.up, CONFIG.silhouette, CONFIG.region)
 
     def monitor(self) -> CameraMonitor:
         tracker = self._tracker()
-        tracker.restore(self.model, self.state)
+        tracker.take_model(self.model)
+        tracker.state = self.state
         return CameraMonitor(tracker, self.setup, self.setup.subjects[0])
 
     def follow(self, spoil: Spoil) -> tuple[CameraMonitor, list[Estimate], list[np.ndarray]]:
@@ -308,10 +310,11 @@ def test_resumed_run_is_the_same(scene: Scene) -> None:
     first = scene.monitor()
     for frame in scene.frames[:6]:
         first.step(spoil(frame))
-    state: Mapping[str, Any] = {**first.tracker.state()}
+    state = first.tracker.state
     again = scene.monitor()
-    again.tracker.restore(scene.model, state)
-    again.restore({name: v if isinstance(v, str) else np.asarray(v) for name, v in first.state().items()})
+    again.tracker.take_model(scene.model)
+    again.tracker.state = state
+    again.state = decode(MonitorState, encode(first.state))  # as after --resume
     for frame, estimate in zip(scene.frames[6:], expected[6:], strict=True):
         np.testing.assert_allclose(again.step(spoil(frame))[0].joints, estimate.joints, rtol=0, atol=1e-9)
     assert again.report() == whole.report()

@@ -76,11 +76,12 @@ def test_walk_is_tracked_and_a_resumed_run_is_the_same() -> None:
         estimates.append(tracker.step(observe(masks, i)))
         if i == 2:
             model = {name: np.copy(v) if isinstance(v, np.ndarray) else v for name, v in tracker.model().items()}
-            state = {name: np.copy(value) for name, value in tracker.state().items()}
+            state = tracker.state
     assert [e.status for e in estimates] == ["initialised"] + ["tracked"] * 5
     assert max(errors(e, p).mean() for e, p in zip(estimates, POSES, strict=True)) < CLOSE_M
     second = RegionTracker(RIG, "z", tracker.contours, tracker.config)
-    second.restore(model, state)
+    second.take_model(model)
+    second.state = state
     for i in range(3, 6):
         again = second.step(observe(MASKS[i], i))
         for name in ("pose", "joints", "sigma", "residual", "objective", "status"):
@@ -183,7 +184,8 @@ def test_run_resumed_after_a_jump_is_the_same() -> None:
     jumped = first.step(observe(masks[0], 1))
     assert jumped.iterations[1] == 1 and any(h.jumped for h in first._alive)
     second = RegionTracker(RIG, "z", first.contours, first.config)
-    second.restore(first.model(), first.state())
+    second.take_model(first.model())
+    second.state = first.state
     a, b = (tracker.step(observe(masks[1], 2)) for tracker in (first, second))
     np.testing.assert_array_equal(a.joints, b.joints)
     assert errors(a, further[1])[JOINTS.index("wrist_r")] < 0.08
@@ -253,7 +255,7 @@ def test_person_is_searched_for_if_the_residual_stays_high(monkeypatch: pytest.M
     tracker = tracker_at(POSES[0])
     for _ in range(3):
         tracker.step(observe(MASKS[0]))
-    state = dict(tracker.state())
+    state = tracker.state
     wrong = tracker.world.poses_in(POSES[0])
     wrong[SKELETON.index("torso_yaw")] += np.radians(105)
     searches = []
@@ -266,8 +268,8 @@ def test_person_is_searched_for_if_the_residual_stays_high(monkeypatch: pytest.M
     monkeypatch.setattr(tracker, "recover", watched)
     monkeypatch.setattr(tracker, "search", lambda _frame, _pyramid, _evidence, pose, *_: (pose[None], np.zeros(1)))
     monkeypatch.setattr(tracker.residuals, "jumped", lambda _: False)  # as if it had risen slowly
-    tracker.restore(tracker.model(), {**state, "poses": wrong[None], "previous": wrong[None]})
-    mean = tracker.state()["residual_mean"]
+    tracker.state = replace(state, alive=[replace(state.alive[0], pose=wrong, previous=wrong)])
+    mean = tracker.state.residuals.mean
     estimates = [tracker.step(observe(MASKS[0])) for _ in range(4)]
     assert [e.status for e in estimates] == ["tracked"] * 4
     assert errors(estimates[1], POSES[0]).mean() > 2 * CLOSE_M
@@ -277,7 +279,7 @@ def test_person_is_searched_for_if_the_residual_stays_high(monkeypatch: pytest.M
     wrong_rays = np.count_nonzero(estimates[3].drawn != person, axis=(1, 2)) / np.count_nonzero(person, axis=(1, 2))
     np.testing.assert_allclose(estimates[3].residual.sum(axis=1), wrong_rays)
     assert wrong_rays.mean() < estimates[1].residual.sum(axis=1).mean() / 2
-    assert (tracker.state()["residual_mean"] - mean).max() < 0.2 * LEAST_SPREAD
+    assert (tracker.state.residuals.mean - mean).max() < 0.2 * LEAST_SPREAD
 
 
 @pytest.mark.parametrize(
@@ -302,13 +304,14 @@ def test_scales_and_iterations_follow_from_how_far_the_prediction_may_err(
     tracker.step(observe(MASKS[0]))
     tracker.fps = fps
     tracker.solver = replace(tracker.solver, tolerance=0.0)
-    before = dict(tracker.state())
-    still = before["poses"][:1]
+    before = tracker.state
+    still = before.alive[0].pose[None]
     step_px = tracker.line_search.window_px * 2 / abs(1 - tracker.contours.prediction)
     step_m = step_px / tracker.views.rig.pixels_per_metre(tracker.body.skeleton.joints(still)[0, 0])
     previous = still.copy()
     previous[0, 0] -= share * step_m
-    tracker.rewind({**before, "poses": still, "previous": previous, **state})
+    best = replace(before.alive[0], pose=still[0], previous=previous[0])
+    tracker.state = replace(before, alive=[best], **state)
     assert tracker.step(observe(MASKS[0])).iterations[0] == steps
 
 
@@ -364,7 +367,7 @@ def test_colors_locate_a_forearm_inside_the_silhouette() -> None:
             tracker.start([observe(masks[0], 0, images[0])], Subject(init=init_of(poses[0]), body=BODY))
             found = [tracker.step(observe(m, i, p)) for i, (m, p) in enumerate(zip(masks, images, strict=True))]
             off[colored] += [errors(e, p)[wrist] for e, p in zip(found[-3:], poses[-3:], strict=True)]
-            assert tracker.colors.known == colored and ("colors" in tracker.state()) == colored
+            assert tracker.colors.known == colored and (tracker.state.colors.counts is not None) == colored
     assert np.mean(off[True]) < 0.07 and np.mean(off[True]) < 0.6 * np.mean(off[False]), off
 
 
@@ -559,6 +562,7 @@ def test_no_heading_is_doubted_that_landmarks_have_shown() -> None:
     tracker = tracker_at(POSES[0])
     tracker.step(replace(observe(MASKS[0], 0), landmarks=seen_at(POSES[0])))
     same = RegionTracker(RIG, "z", SETTINGS)
-    same.restore(tracker.model(), tracker.state())
+    same.take_model(tracker.model())
+    same.state = tracker.state
     for known in (tracker, same):
         assert known.heading_hypotheses([MASKS[0]], POSES[:1], None) == ()

@@ -77,7 +77,7 @@ def test_wrong_pose_raises_the_baseline_slowly() -> None:
 
 def test_state_is_restored() -> None:
     baseline, other = learned(), ResidualBaseline(VIEWS, 0.02)
-    other.restore(baseline.state())
+    other.state = baseline.state
     np.testing.assert_array_equal(other.excess(np.full(VIEWS, 0.2)), baseline.excess(np.full(VIEWS, 0.2)))
 
 

@@ -1,5 +1,7 @@
 """The volumetric tracker: what tests/test_session.py and test_region_track.py do not see from outside."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -23,14 +25,15 @@ def test_limb_search_recovers_a_displaced_arm(angles: tuple[float, ...]) -> None
     config = Settings(voxels=48, volumetric=VolumetricSettings(edge_weight=0.0))  # one colour has no edges
     tracker = VolumetricTracker(rig, Volume((0, 0, 1), (2, 2, 2.2)), "z", config)
     tracker.start([observe(masks, 0, images)], Subject(STATURE, body=BODY))
-    model, state = dict(tracker.model()), dict(tracker.state())
-    wrong = state["pose"].copy()
+    model, state = dict(tracker.model()), tracker.state
+    wrong = state.pose.copy()
     names = ("shoulder_l_yaw", "shoulder_l_pitch", "shoulder_l_roll", "elbow_l_flexion")
     wrong[[tracker.skin.skeleton.index(name) for name in names]] = angles
     off = {}
     due = tracker._finder.search_frames
     for index in (due, due + 1):
-        tracker.restore(model, {**state, "pose": wrong, "previous": wrong})
+        tracker.take_model(model)
+        tracker.state = replace(state, pose=wrong, previous=wrong)
         off[index] = errors(tracker.step(observe(masks, index, images)), pose)[JOINTS.index("wrist_l")]
     assert off[due + 1] > 0.4  # a descent alone does not come back
     assert off[due] < 0.05

@@ -13,7 +13,7 @@ from tk.io.captures.capture import Capture
 from tk.model.cues.ray_costs import RayGrid
 from tk.model.people import LocatedPerson, PeopleFinder, order_people
 from tk.trackers.contour_finder import CHOICE_ROWS
-from tk.trackers.protocol import Observation
+from tk.trackers.protocol import Frame
 from tk.trackers.sharing import UNKNOWN_BY_HULLS, assign, cast_points
 
 Float = NDArray[np.float64]
@@ -151,7 +151,7 @@ class PeopleWatch:
         by_distance = sorted(found, key=lambda person: float(np.linalg.norm(person.position - last.position)))
         grid = RayGrid(rig, CHOICE_ROWS)
         hulls = [cast_points(rig, grid, person.points, person.voxel_m) for person in by_distance]
-        whole = Observation(index, np.empty((len(rig), 0, 0, 3), np.uint8), masks)
+        whole = Frame(index, np.empty((len(rig), 0, 0, 3), np.uint8), masks)
         owners = assign(rig, grid, hulls, whole, UNKNOWN_BY_HULLS)
         return owners.share(whole, 0, False).masks
 

@@ -17,10 +17,9 @@ from pathlib import Path
 
 from tk.errors import ConfigError, ExportError, TkError, unwritable
 
-#: files and folders of a capture that tk reads; the last pattern is that of MoBo's images
+#: files and folders of a capture that tk reads
 _CAPTURE_PARTS = (
     "calibration.toml", "capture.toml", "truth.h5", "videos", "images", "background", "masks", "timestamps",
-    "vr[0-9][0-9]*",
 )  # fmt: skip
 
 

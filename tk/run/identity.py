@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.captures.mask_store import MaskStore
+from tk.io.captures.mask_store import MaskStore, MaskStores
 from tk.io.results.data import Result
 from tk.io.results.status import Status
+from tk.model.cues.part_colors import LearnedColors
 from tk.model.masks.image_health import described
 
 Float = NDArray[np.float64]
@@ -55,7 +56,7 @@ class Contact:
     pelvis: Float
     shorter_m: float = -np.inf
     outcome: int = OPEN
-    learned: tuple[Mapping[str, Any], ...] = field(default=(), repr=False)
+    learned: tuple[LearnedColors, ...] = field(default=(), repr=False)
 
 
 class Contacts:
@@ -65,14 +66,14 @@ class Contacts:
         self.all: list[Contact] = []
 
     def update(
-        self, frame: int, pelvis: Mapping[int, Float], learned: Mapping[int, Mapping[str, Any]]
+        self, frame: int, pelvis: Mapping[int, Float], learned: Mapping[int, LearnedColors | None]
     ) -> list[Contact]:
         """Return the contacts that have ended.
 
         Args:
             frame: number of the frame.
             pelvis: (3,) m, of each person who is tracked in it.
-            learned: colours of each person.
+            learned: colours of each person; None if they are unknown.
         """
         now = {c.people: c for c in self.all if c.outcome == OPEN}
         ended = []
@@ -82,9 +83,10 @@ class Contacts:
                 both = np.array([pelvis[a], pelvis[b]])
                 distance_m = float(np.linalg.norm(both[0] - both[1]))
                 contact = now.get((a, b))
-                if contact is None and distance_m < CONTACT_M and learned[a] and learned[b]:
-                    colors = (learned[a], learned[b])
-                    self.all.append(Contact((a, b), frame, frame, frame, both, learned=colors))
+                if contact is None and distance_m < CONTACT_M:
+                    colors = tuple(c for c in (learned[a], learned[b]) if c is not None)
+                    if len(colors) == 2:
+                        self.all.append(Contact((a, b), frame, frame, frame, both, learned=colors))
                 elif contact is not None:
                     kept, crossed = (
                         np.linalg.norm(order - contact.pelvis, axis=1).sum() for order in (both, both[::-1])
@@ -95,27 +97,6 @@ class Contacts:
                     if distance_m >= CONTACT_M:
                         ended.append(contact)
         return ended
-
-    def state(self) -> dict[str, Any]:
-        """Return what :meth:`restore` needs."""
-        rows = [(*c.people, c.first, c.last, c.moment, c.outcome, c.shorter_m, *c.pelvis.flat) for c in self.all]
-        state: dict[str, Any] = {"table": np.array(rows, np.float64).reshape(-1, 13)}
-        for k, contact in enumerate(self.all):
-            for n, learned in enumerate(contact.learned if contact.outcome == OPEN else ()):
-                state |= {f"{k}/{n}/{name}": value for name, value in learned.items()}
-        return state
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state."""
-        self.all = []
-        for k, row in enumerate(np.asarray(state["table"])):
-            a, b, first, last, moment, outcome = row[:6].astype(int).tolist()
-            prefixes = [f"{k}/{n}/" for n in (0, 1)]
-            learned = tuple(
-                {name.removeprefix(p): value for name, value in state.items() if name.startswith(p)} for p in prefixes
-            )
-            pelvis = row[7:].reshape(2, 3)
-            self.all.append(Contact((a, b), first, last, moment, pelvis, float(row[6]), outcome, learned))
 
 
 def outcome_of(likeness: Float, shorter_m: float) -> int:
@@ -168,14 +149,24 @@ def report(contacts: Sequence[Contact]) -> list[str]:
     return lines
 
 
-def exchange_masks(contact: Contact, masks: Sequence[MaskStore]) -> None:
-    """Exchange the masks of two people in the frames that :func:`exchanged` exchanges."""
-    one, other = masks
-    for frame in range(contact.moment, contact.last + 1):
-        if frame in one and frame in other:
-            of_one, of_other = one.get(frame), other.get(frame)
-            one.put(frame, of_other)
-            other.put(frame, of_one)
+def exchanged_masks(
+    person: int, contacts: Sequence[Contact], masks: MaskStores | Mapping[int, MaskStore], frames: NDArray[np.int64]
+) -> MaskStore:
+    """Return a person's masks of frames (F,), those that :func:`exchanged` exchanges taken from the other person; the
+    stores stay as they are."""
+    mixed = [c for c in contacts if c.outcome == EXCHANGED]
+    if not any(person in contact.people for contact in mixed):
+        return masks[person]
+    result = MaskStore()
+    for frame in frames.tolist():
+        owner = {n: n for contact in mixed for n in contact.people}
+        for contact in mixed:
+            a, b = contact.people
+            if contact.moment <= frame <= contact.last and frame in masks[a] and frame in masks[b]:
+                owner[a], owner[b] = owner[b], owner[a]
+        if frame in masks[owner[person]]:
+            result.put(frame, masks[owner[person]].get(frame))
+    return result
 
 
 def _with_rows(to: Result, rows: NDArray[np.int64], source: Result, other: NDArray[np.int64]) -> Result:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Container, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -15,17 +15,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from tk.errors import CaptureError, ResultError, TkError
 from tk.io.captures.mask_store import MaskStores
+from tk.io.results.codec import decode, encode
 from tk.io.results.data import HullPoints, Value
 from tk.io.results.reader import as_damage_error, read_result
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
 from tk.run.member import Tracked
 from tk.run.offline import REFINED
-from tk.run.people import People
+from tk.run.people import People, PeopleState
 from tk.run.plan import Plan
 from tk.run.prefetch import Observed
 from tk.threads import one_thread
-from tk.trackers.protocol import Estimate, Observation, shows_person, two_pass
+from tk.trackers.protocol import Estimate, Frame, shows_person, two_pass
 
 _LOG = logging.getLogger(__name__)
 
@@ -79,7 +80,6 @@ class Loop:
     Attributes:
         tracked: number of frames, even if the run is interrupted.
         people: who is tracked.
-        finished: the people whose result an earlier run has finished.
     """
 
     def __init__(
@@ -92,7 +92,6 @@ class Loop:
         self.plan, self.output, self.masks, self._note = plan, output, masks, note
         self.tracked = 0
         self._held: list[dict[int, dict[str, ArrayLike]]] = []  # rows of frames that are not in the file yet
-        self.finished: Container[int] = ()
         self.people = People(plan.task, plan.tracker, note)
 
     def frames(self) -> Iterator[tuple[Estimate, ...]]:
@@ -165,12 +164,8 @@ class Loop:
         if output is None or not output.done or not tracker.has_segments:
             return False
         one_pass = self.plan.task.options.causal or not tracker.has_second_pass
-        self.finished = {
-            person
-            for person, (model, result) in enumerate(zip(output.writer.models, read_result(path).people, strict=True))
-            if result.smoothed is not None and (one_pass or REFINED in model)
-        }
-        if len(self.finished) == len(output.writer.models):
+        results = zip(output.writer.models, read_result(path).people, strict=True)
+        if all(r.smoothed is not None and (one_pass or REFINED in model) for model, r in results):
             return False
         output.check()
         self._restore(output)
@@ -178,7 +173,7 @@ class Loop:
 
     def _restore(self, output: Output) -> None:
         with as_damage_error(output.writer.path, "the state of the run"):
-            self.people.restore(output.writer.models, output.writer.state)
+            self.people.resume(output.writer.models, decode(PeopleState, output.writer.state))
 
     def _step_through(self, observations: Iterator[Observed]) -> Iterator[tuple[Estimate, ...]]:
         """Step the trackers to the end; estimates are yielded when they are in the file."""
@@ -226,7 +221,7 @@ class Loop:
         self.tracked += len(self._held)
         self._held.clear()
 
-    def _step(self, observation: Observation) -> tuple[Estimate, ...] | None:
+    def _step(self, observation: Frame) -> tuple[Estimate, ...] | None:
         """Step all trackers; return the estimates of the people who are present, None before the first frame to be
         written."""
         with one_thread():
@@ -267,7 +262,7 @@ class Loop:
 
     def _state(self, output: Output) -> Mapping[str, Value]:
         origin = {_ORIGIN + name: value for name, value in output.origin.items()}
-        return {**self.people.state(), **origin}
+        return {**encode(self.people.state()), **origin}
 
 
 def _fill(taken: list[Observed], observations: Iterator[Observed], count: int) -> Iterator[Observed]:

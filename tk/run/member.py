@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,8 +11,10 @@ from numpy.typing import NDArray
 from tk.kernels.mask_values import PERSON
 from tk.model.cameras.camera import Rig
 from tk.model.setup import Subject
-from tk.trackers.camera_monitor import CameraMonitor
-from tk.trackers.protocol import Estimate, Observation, SharingTracker, Tracker, sharing, without_cameras
+from tk.model.stateful import Stateful
+from tk.trackers.camera_monitor import CameraMonitor, MonitorState
+from tk.trackers.protocol import Estimate, Frame, SharingTracker, Tracker, sharing, without_cameras
+from tk.trackers.registry import TrackerState
 from tk.trackers.sharing import UNKNOWN
 
 Float = NDArray[np.float64]
@@ -23,9 +23,6 @@ Float = NDArray[np.float64]
 # frame's motion of a fist.
 _ALONE_M = 0.25
 
-_DRAWN, _PLACE = "drawn", "place"
-_WATCH, _LOST, _ABSENT = "watch/", "lost", "absent"
-
 
 @dataclass(frozen=True)
 class Tracked:
@@ -33,13 +30,27 @@ class Tracked:
     and what its tracker used."""
 
     estimate: Estimate
-    share: Observation
-    used: Observation
+    share: Frame
+    used: Frame
+
+
+@dataclass(frozen=True)
+class MemberState:
+    """What changes from frame to frame, see :class:`Member`."""
+
+    tracker: TrackerState
+    monitor: MonitorState
+    lost: bool
+    absent: bool
+    drawn: NDArray[np.bool_] | None
+    place: Float | None
 
 
 @dataclass
-class Member:
+class Member(Stateful[MemberState]):
     """A person who is tracked."""
+
+    State = MemberState
 
     number: int  # in the result; people who are not written have higher numbers
     subject: Subject  # what is known of the person
@@ -58,7 +69,7 @@ class Member:
         assert tracker is not None
         return tracker
 
-    def step(self, share: Observation) -> Tracked:
+    def step(self, share: Frame) -> Tracked:
         """Return the answer for this person's share of the next frame."""
         estimate, used = self.monitor.step(share)
         self.lost = estimate.status == "lost"
@@ -95,21 +106,3 @@ class Member:
         sampled = self.sharing.screen.sample(masks)
         covered = np.count_nonzero(body, axis=(1, 2))
         return bool((np.count_nonzero(body & (sampled < PERSON), axis=(1, 2)) >= 0.5 * covered).all())
-
-    def state(self) -> dict[str, Any]:
-        """Return what :meth:`restore`, and that of the tracker, need."""
-        watch = {_WATCH + name: value for name, value in self.monitor.state().items()}
-        drawn = {} if self.drawn is None else {_DRAWN: self.drawn, _PLACE: self.place}
-        return {**self.tracker.state(), **watch, **drawn, _LOST: self.lost, _ABSENT: self.absent}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state; the caller restores the tracker."""
-        self.monitor.restore(below(_WATCH, state))
-        self.lost, self.absent = bool(state[_LOST]), bool(state[_ABSENT])
-        self.drawn = np.array(state[_DRAWN], np.bool_) if _DRAWN in state else None
-        self.place = np.array(state[_PLACE], np.float64) if _PLACE in state else None
-
-
-def below(prefix: str, state: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of a state whose names begin with a prefix, without it."""
-    return {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,10 +12,8 @@ from numpy.typing import NDArray
 
 from tk.io.captures.mask_store import MaskStore, MaskStores
 from tk.io.results.data import Result, UsedCameras, Value
-from tk.io.results.reader import read_result
-from tk.io.results.revision import revise_result
+from tk.io.results.revision import Revision
 from tk.io.results.status import Status
-from tk.kernels.projection import pack_cameras
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.bundle import TrackedPoses
 from tk.model.cameras.camera import Rig
@@ -25,7 +22,7 @@ from tk.model.masks.image_health import described
 from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
 from tk.run.delays import retimed, retimed_landmarks
-from tk.run.identity import COLUMNS, EXCHANGED, UNCLEAR, doubtful, exchange_masks, exchanged, report
+from tk.run.identity import COLUMNS, doubtful, exchanged, exchanged_masks, report
 from tk.run.member import Member
 from tk.run.people import People
 from tk.run.prefetch import open_observations
@@ -57,8 +54,6 @@ HEADING_FRAMES = 12
 
 #: entry in `/model` of a result after the second pass
 REFINED = "refined"
-# Differences of cameras that a result file rounds, in the units of a calibration; a refinement changes more.
-_ROUNDED = 1e-7
 # A joint keeps its sigma of the first pass where that exceeds the sigma of the second pass by this factor. With 1, 5 %
 # more of walk's joints are within one sigma, where 12 % too many are; 4 changes such shares by less than 1 %. Without
 # the rule, joints more than 15 cm off with a sigma below 5 cm rise from 0 to 0.1 % (dance, three cameras) and from 1.0
@@ -66,43 +61,52 @@ _ROUNDED = 1e-7
 _LESS_SURE = 2.0
 
 
+@dataclass(frozen=True)
+class Finished:
+    """What all frames of a run together give.
+
+    Attributes:
+        revisions: of each person's result, by number.
+        cameras: the cameras of the recorded images, refined if they were; None if the tracker has no segments.
+    """
+
+    revisions: Mapping[int, Revision]
+    cameras: UsedCameras | None
+
+
 def finish(
-    output: Path,
+    found: Sequence[Result],
     task: Task,
     people: People,
     masks: MaskStores | None,
     note: Note,
     within: Callable[[float], None],
-    finished: Container[int] = (),
-) -> None:
-    """Write what needs all frames, see :meth:`_Finisher.finish`, for the people who are not ``finished``, after people
-    who were mixed up are exchanged.
+) -> Finished:
+    """Return what needs all frames, see :meth:`_Finisher.finish`, after people who were mixed up are exchanged.
 
-    The second pass uses ``masks``; None: no second pass. ``within`` receives the share of a long stage that is done.
+    Args:
+        found: each person's result of the first pass.
+        task, people: of the run.
+        masks: for the second pass; None: no second pass.
+        note: receives lines for the user.
+        within: receives the share of a long stage that is done.
     """
     members, contacts = people.members, people.contacts
     cameras = UsedCameras(task.setup.rig, np.array(task.source.time_offset_s))
-    finisher = _Finisher(output, task, len(members) == 1, note, within, cameras)
-    if finished:  # the first pass of a finished person is gone
-        contacts = [replace(c, outcome=UNCLEAR) if c.outcome == EXCHANGED else c for c in contacts]
-    found = read_result(output).people
+    finisher = _Finisher(task, len(members) == 1, note, within, cameras)
     results = exchanged(found, contacts)
-    for contact in contacts:
-        if contact.outcome == EXCHANGED and masks is not None:
-            exchange_masks(contact, [masks[number] for number in contact.people])
     for line in report(contacts):
         note(line)
-    for member in members:
-        number = member.number
-        if number in finished:
-            finisher.use_cameras_of_file()
-            continue
-        result = results[number]
+    revisions = {}
+    for member in members if people.has_segments else ():
+        result, number = results[member.number], member.number
         draft = _Draft(result, ~result.has_pose, result.has_pose & doubtful(result, contacts))
         if result is not found[number]:
             columns = {dataset: getattr(result, name) for dataset, name in COLUMNS.items()}
             draft.columns = {dataset: values for dataset, values in columns.items() if values is not None}
-        finisher.finish(member, draft, None if masks is None else masks[number])
+        own = None if masks is None else exchanged_masks(number, contacts, masks, result.frames)
+        revisions[number] = finisher.finish(member, draft, own)
+    return Finished(revisions, finisher.cameras.recorded() if revisions else None)
 
 
 @dataclass
@@ -142,26 +146,15 @@ class _Draft:
 class _Finisher:
     """Finishes people one after the other. Person 0 decides whether the cameras are refined."""
 
-    output: Path
     task: Task
     alone: bool  # whether the result has one person
     note: Note
     within: Callable[[float], None]
     cameras: UsedCameras
 
-    def use_cameras_of_file(self) -> None:
-        """Use the cameras of a person who was finished by an earlier run, if they are other ones."""
-        rig, stored = self.task.setup.rig, read_result(self.output).cameras or self.cameras
-        used = stored.rig.recorded().reduced(rig.reductions)
-        if not np.allclose(pack_cameras(used), pack_cameras(rig), rtol=_ROUNDED, atol=_ROUNDED):
-            self.cameras = replace(stored, rig=used)
-
-    def finish(self, member: Member, draft: _Draft, masks: MaskStore | None) -> None:
-        """Write what needs all frames of a person: the second pass; segments, feet and angles; the smoothed copy;
-        cameras. The result is replaced in one step: if this is interrupted, the result of the first pass stays."""
+    def finish(self, member: Member, draft: _Draft, masks: MaskStore | None) -> Revision:
+        """Return what needs all frames of a person: the second pass; segments, feet and angles; the smoothed copy."""
         tracker, setup = member.tracker, self.task.setup
-        if not tracker.has_segments:
-            return
         model: Mapping[str, Value] | None = None
         again = two_pass(tracker)
         if again is not None and masks is not None and self._complete(masks, member.number, again, draft.result):
@@ -176,8 +169,7 @@ class _Finisher:
         columns = draft.columns | {name: v for name, v in _columns(body, poses).items() if name not in kept}
         filtered = smooth(body.skeleton, poses, ~draft.lost, setup.fps)
         smoothed = {**_columns(body, filtered.poses), "bridged": filtered.bridged}
-        cameras = self.cameras.recorded()
-        revise_result(self.output, columns, smoothed=smoothed, model=model, cameras=cameras, person=member.number)
+        return Revision(columns, smoothed, model)
 
     def _complete(self, masks: MaskStore, person: int, tracker: TwoPassTracker, result: Result) -> bool:
         """Return whether a person's masks of all frames are known. Those that an earlier run has used are made again if

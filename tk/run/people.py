@@ -14,7 +14,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
@@ -32,11 +32,11 @@ from tk.model.people import LocatedPerson, PeopleFinder, order_people
 from tk.model.setup import Subject
 from tk.run.choice import chosen, matched, unknown
 from tk.run.identity import EXCHANGED, UNCLEAR, Contact, Contacts, outcome_of
-from tk.run.member import Member, Tracked, below
+from tk.run.member import Member, MemberState, Tracked
 from tk.run.one_person import really_there
 from tk.run.task import Task
 from tk.trackers.camera_monitor import CameraMonitor, spread_over
-from tk.trackers.protocol import Estimate, Observation, Tracker, sharing
+from tk.trackers.protocol import Estimate, Frame, Tracker, sharing
 from tk.trackers.sharing import UNKNOWN_BY_HULLS, PixelOwners, assign, cast_points
 
 _LOG = logging.getLogger(__name__)
@@ -60,10 +60,33 @@ _UNEXPLAINED = 0.25
 # colours and body: -0.1 to -0.7 for the same person, -1.6 to -3.7 for the other one.
 _SAME_COLORS = -1.1
 
-_PEOPLE = "people/"
-_SUBJECT, _IN_INIT_POSE = "subject", "in_init_pose"  # the number of the subject, -1: unknown
-_NUMBER, _GIVEN = "number", "given"
-_MODEL, _CONTACTS = "body/", "contacts/"
+
+@dataclass(frozen=True)
+class PersonState:
+    """A person who is tracked.
+
+    Attributes:
+        number: see :class:`~tk.run.member.Member`.
+        subject: number of the subject; None: nothing is known of the person.
+        in_init_pose: whether the subject began in the initialisation pose.
+        body: of a person who is not in the result; None of others.
+        member: what changes from frame to frame.
+    """
+
+    number: int
+    subject: int | None
+    in_init_pose: bool
+    body: dict[str, Any] | None
+    member: MemberState
+
+
+@dataclass(frozen=True)
+class PeopleState:
+    """The people who are tracked, the numbers of those who have had a tracker, and the contacts."""
+
+    tracked: list[PersonState]
+    given: list[int]
+    contacts: list[Contact]
 
 
 class People:
@@ -81,7 +104,7 @@ class People:
         self._tracked: list[Member] = []
         self._contacts = Contacts()
         self._every = max(1, round(LOOK_EVERY_S * task.setup.fps))
-        self._unknown: deque[Observation] = deque(maxlen=_HISTORY)  # people who are unknown, in the last frames
+        self._unknown: deque[Frame] = deque(maxlen=_HISTORY)  # people who are unknown, in the last frames
         self._refused = 0  # consecutive people who could not be tracked
         self._admit_from = 0  # the frame from which on another may be
         # numbers, as `tk inspect` prints them, of the people who have had a tracker; None before the first frame
@@ -115,6 +138,11 @@ class People:
         return found
 
     @property
+    def has_segments(self) -> bool:
+        """Whether segments, angles and a smoothed copy follow from the poses."""
+        return self._first.has_segments
+
+    @property
     def several(self) -> bool:
         """Whether the result may have several people: each then has rows only for frames in which the person is
         present."""
@@ -127,7 +155,7 @@ class People:
 
     # --- the first frames ---------------------------------------------------------------------------------------------
 
-    def start(self, opening: Sequence[Observation], given_masks: bool = False) -> bool:
+    def start(self, opening: Sequence[Frame], given_masks: bool = False) -> bool:
         """Find the people in the first frame, and start a tracker for everybody in the volume.
 
         Masks that were made from the images belong to them; ``given_masks`` are compared with them.
@@ -188,7 +216,7 @@ class People:
         self._setup = replace(self._setup, subjects=tuple(subjects))
 
     def _start(
-        self, opening: Sequence[Observation], found: Sequence[LocatedPerson], numbers: Sequence[int], alone: bool
+        self, opening: Sequence[Frame], found: Sequence[LocatedPerson], numbers: Sequence[int], alone: bool
     ) -> None:
         """Start the trackers of the people found in the first frame. ``numbers``: of those chosen; ``alone``: the hulls
         show one person at most."""
@@ -222,7 +250,7 @@ class People:
         return self._make() if self._tracked else self._first
 
     def _begin(
-        self, member: Member, frames: Sequence[Observation], hull_m: float | None, whole: Sequence[Observation] = ()
+        self, member: Member, frames: Sequence[Frame], hull_m: float | None, whole: Sequence[Frame] = ()
     ) -> None:
         """Start a tracker.
 
@@ -240,11 +268,11 @@ class People:
     def _finder(self) -> PeopleFinder:
         return PeopleFinder(self._setup.rig, self._setup.volume, self._setup.up)
 
-    def _several_in(self, opening: Sequence[Observation]) -> bool:
+    def _several_in(self, opening: Sequence[Frame]) -> bool:
         """Return whether several people are found in some frame of the opening."""
         return any(len(self._finder.find(f.masks, f.uncertain)) > 1 for f in spread_over(opening, _TESTED))
 
-    def _shares(self, people: Sequence[LocatedPerson], frames: Sequence[Observation]) -> list[list[Observation]]:
+    def _shares(self, people: Sequence[LocatedPerson], frames: Sequence[Frame]) -> list[list[Frame]]:
         """Return the observations of each person in consecutive frames, by hulls that are carved again in each.
 
         A person's observations end where the hull grows or shrinks as no body does: there it shows a part of somebody
@@ -259,7 +287,7 @@ class People:
         places = [person.position for person in people]
         counts = [len(person.points) for person in people]
         hulls = [cast_points(rig, grid, person.points, person.voxel_m) for person in people]
-        shares: list[list[Observation]] = [[] for _ in people]
+        shares: list[list[Frame]] = [[] for _ in people]
         at_first: list[int] = []  # voxels of each hull in the second frame: in the first, all masks carved it
         mixed = [False] * len(people)
         for frame in frames:
@@ -280,7 +308,7 @@ class People:
 
     # --- one frame ----------------------------------------------------------------------------------------------------
 
-    def step(self, frame: Observation) -> dict[int, Tracked]:
+    def step(self, frame: Frame) -> dict[int, Tracked]:
         """Return the answers of the people in the result who are tracked, by number.
 
         Before that person is tracked, a result of one person has the status absent, or lost if the first person in the
@@ -305,7 +333,7 @@ class People:
                 answers[member.number] = replace(answer, estimate=replace(answer.estimate, status="absent"))
         return {m.number: answers[m.number] for m in self.members} or self._nobody(frame, "absent")
 
-    def _step_all(self, frame: Observation) -> tuple[dict[int, Tracked], PixelOwners]:
+    def _step_all(self, frame: Frame) -> tuple[dict[int, Tracked], PixelOwners]:
         """Return the answers of all members, and the owners of the pixels at the poses that were expected."""
         owners = self._owners(frame, ahead=True)
         answers = {
@@ -314,7 +342,7 @@ class People:
         }
         return answers, owners
 
-    def _owners(self, frame: Observation, ahead: bool = False) -> PixelOwners:
+    def _owners(self, frame: Frame, ahead: bool = False) -> PixelOwners:
         """Return the owners of a frame's pixels, in the order of the members, by their bodies at the last pose, or at
         the pose expected in the next frame if ``ahead``."""
         assert self._grid is not None
@@ -339,15 +367,15 @@ class People:
             contact.outcome = outcome_of(likeness, contact.shorter_m)
             _LOG.debug("contact of %s, frames %d to %d: %s", contact.people, contact.first, contact.last, likeness)
             if contact.outcome == EXCHANGED:
-                states = [member.state() for member in pair]
+                states = [member.state for member in pair]
                 for member, state, colors in zip(pair, states[::-1], contact.learned, strict=True):
-                    member.sharing.rewind({**state, **colors})
-                    member.restore(state)
+                    tracker: Any = state.tracker
+                    member.state = replace(state, tracker=replace(tracker, colors=colors))
             contact.learned = ()
 
     # --- who enters and leaves ----------------------------------------------------------------------------------------
 
-    def _look(self, frame: Observation, owners: PixelOwners | None) -> dict[int, Tracked]:
+    def _look(self, frame: Frame, owners: PixelOwners | None) -> dict[int, Tracked]:
         """Find people who enter or leave, and return the answers of those who enter.
 
         ``owners``: of the frame's pixels; None if the only person got all.
@@ -404,7 +432,7 @@ class People:
         self._begin_in_any_pose(number)
         return self._setup.subjects[number]
 
-    def _newcomers(self, frame: Observation, owners: PixelOwners) -> list[LocatedPerson]:
+    def _newcomers(self, frame: Frame, owners: PixelOwners) -> list[LocatedPerson]:
         """Return the people in the working volume whom the pixels show that no body explains."""
         *areas, unexplained = owners.areas(frame.masks)
         person = max((float(np.median(area)) for area in areas), default=0.0)
@@ -413,9 +441,7 @@ class People:
         masks = owners.unknown(frame).masks
         return [p for p in self._finder.find(masks >= PERSON, hidden=masks == OTHERS) if p.inside]
 
-    def _admit(
-        self, frames: Sequence[Observation], person: LocatedPerson, subject: Subject, written: bool
-    ) -> Member | None:
+    def _admit(self, frames: Sequence[Frame], person: LocatedPerson, subject: Subject, written: bool) -> Member | None:
         """Add a person who is tracked from the first of some frames on; None if nobody can be tracked."""
         # people who are not written have higher numbers than all who are, now and later
         higher = len(self._choice) if isinstance(self._choice, tuple) else 1
@@ -437,7 +463,7 @@ class People:
         self._refused += 1
         self._admit_from = frame + self._every * min(2 ** (self._refused - 1), _LONGEST_PAUSE)
 
-    def _nobody(self, frame: Observation, status: str) -> dict[int, Tracked]:
+    def _nobody(self, frame: Frame, status: str) -> dict[int, Tracked]:
         """Return the answers in a frame before somebody who is in the result is tracked."""
         return {} if self.several else {0: Tracked(replace(self._no_pose, status=status), frame, frame)}
 
@@ -469,41 +495,39 @@ class People:
             return [*self.members[0].monitor.report(), *missing]
         return [*(f"person {m.number}: {line}" for m in self.members for line in m.monitor.report()), *missing]
 
-    def state(self) -> dict[str, Any]:
-        """Return what :meth:`restore` needs beside the bodies. Person 0's entries have no prefix."""
-        state: dict[str, Any] = {}
-        for k, member in enumerate(self._tracked):
-            prefix = f"{_PEOPLE}{k}/" if k else ""
-            number = next((k for k, known in enumerate(self._setup.subjects) if known is member.subject), -1)
-            known = {_SUBJECT: number, _IN_INIT_POSE: member.subject.in_init_pose, _NUMBER: member.number}
-            own = {**member.state(), **known}
-            state |= {prefix + name: value for name, value in own.items()}
-            if not member.written:
-                state |= {f"{prefix}{_MODEL}{name}": value for name, value in member.tracker.model().items()}
-        state[_GIVEN] = np.array(sorted(self._given or ()), np.int64)
-        return state | {_CONTACTS + name: value for name, value in self._contacts.state().items()}
+    def state(self) -> PeopleState:
+        """Return what :meth:`resume` needs."""
+        subjects = self._setup.subjects
+        tracked = [
+            PersonState(
+                number=member.number,
+                subject=next((k for k, known in enumerate(subjects) if known is member.subject), None),
+                in_init_pose=member.subject.in_init_pose,
+                body=None if member.written else dict(member.tracker.model()),
+                member=member.state,
+            )
+            for member in self._tracked
+        ]
+        return PeopleState(tracked, sorted(self._given or ()), self._contacts.all)
 
-    def restore(self, models: Sequence[Mapping[str, Any]], state: Mapping[str, Any]) -> None:
+    def resume(self, models: Sequence[Mapping[str, Any]], state: PeopleState) -> None:
         """Continue a run. Earlier frames are not stored, so a person who has just entered may be tracked later.
 
         Args:
             models: bodies of the people in the result.
             state: of :meth:`state`.
         """
-        k = 0
-        while own := below(f"{_PEOPLE}{k}/", state) if k else state:
-            subject, in_init_pose = int(own[_SUBJECT]), bool(own[_IN_INIT_POSE])
-            if subject >= 0 and self._setup.subjects[subject].in_init_pose and not in_init_pose:
-                self._begin_in_any_pose(subject)
-            known = self._setup.subjects[subject] if subject >= 0 else Subject(in_init_pose=in_init_pose)
-            tracker, number = self._make() if k else self._first, int(own[_NUMBER])
-            member = self._member(number, known, tracker, written=number < len(models))
-            self._tracked[k:] = [member]
-            tracker.restore(models[number] if member.written else below(_MODEL, own), own)
-            member.restore(own)
-            k += 1
-        self._given = {int(number) for number in state[_GIVEN]}
-        self._contacts.restore(below(_CONTACTS, state))
+        self._tracked = []
+        for person in state.tracked:
+            k, subjects = person.subject, self._setup.subjects
+            if k is not None and subjects[k].in_init_pose and not person.in_init_pose:
+                self._begin_in_any_pose(k)
+            known = Subject(in_init_pose=person.in_init_pose) if k is None else self._setup.subjects[k]
+            member = self._member(person.number, known, self._new_tracker(), written=person.body is None)
+            member.tracker.take_model(models[person.number] if person.body is None else person.body)
+            member.state = person.member
+            self._tracked.append(member)
+        self._given, self._contacts.all = set(state.given), state.contacts
 
 
 def _not_entered(number: int) -> str:

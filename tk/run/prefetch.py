@@ -46,11 +46,11 @@ from tk.run import worker
 from tk.run.segmentation import Labeller, make_labeller, mask_source, prepare_kernels
 from tk.run.task import Task
 from tk.segmenters import Segmenter
-from tk.trackers.protocol import Observation, Stopwatch
+from tk.trackers.protocol import Frame, Stopwatch
 
 Note = Callable[[str], None]
 #: a frame, and its seconds: "decode", "masks", and "wait", the time that the tracker waited for it
-Observed = tuple[Observation, Mapping[str, float]]
+Observed = tuple[Frame, Mapping[str, float]]
 
 TIMING_STAGES = ("decode", "masks", "wait")
 
@@ -119,7 +119,7 @@ def _can_be_sent(segmenter: Segmenter | None) -> bool:
 
 def observe(
     task: Task, label: Labeller, note: Note, span: tuple[int, int | None], keep_images: bool, film: Film | None
-) -> Iterator[tuple[Observation, Stopwatch]]:
+) -> Iterator[tuple[Frame, Stopwatch]]:
     """Decode and segment frames in this process; ``span``: first frame, and the end, exclusive."""
     shapes = [(camera.height, camera.width) for camera in task.setup.rig]
     with task.source.frames(*span) as frames:
@@ -131,15 +131,12 @@ def observe(
             if film is not None:
                 film.put(frame.index, [image[:h, :w] for image, (h, w) in zip(frame.images, shapes, strict=True)], note)
             watch.lap("decode")
-            masks, uncertain, sources, landmarks = label(frame)
-            images = frame.images if keep_images else np.empty((len(masks), 0, 0, 3), np.uint8)
+            labelled = Frame(frame.index, frame.images, time=frame.time, **label(frame)._asdict())
+            if not keep_images:
+                empty = np.empty((len(labelled.masks), 0, 0, 3), np.uint8)
+                labelled = replace(labelled, images=empty, uncertain=None)
             watch.lap("masks")
-            yield (
-                Observation(
-                    frame.index, images, masks, uncertain if keep_images else None, frame.time, sources, landmarks
-                ),
-                watch,
-            )
+            yield labelled, watch
 
 
 @dataclass(frozen=True)
@@ -179,14 +176,11 @@ class _Order:
 
 @dataclass(frozen=True)
 class _Ready:
-    """A frame lies in a slot. ``uncertain``: whether the observation has uncertain pixels."""
+    """A frame lies in a slot. ``frame``: without images and pixels; ``uncertain``: whether it has uncertain pixels."""
 
     slot: int
-    index: int
-    time: float
+    frame: Frame
     uncertain: bool
-    sources: NDArray[np.uint8] | None
-    landmarks: NDArray[np.float64] | None
     laps: Mapping[str, float]
 
 
@@ -272,7 +266,7 @@ class Ahead:
             yield observation, {**message.laps, "wait": time.perf_counter() - asked}
             del observation
 
-    def _take(self, ready: _Ready) -> Observation:
+    def _take(self, ready: _Ready) -> Frame:
         size = self._layout.bytes
         slot = np.frombuffer(self._memory, np.uint8, size, ready.slot * size)
         if self._free:
@@ -284,7 +278,7 @@ class Ahead:
             self._send(ready.slot)
         images, masks, uncertain = self._layout.layers(slot)
         unsure = uncertain if ready.uncertain else None
-        return Observation(ready.index, images, masks, unsure, ready.time, ready.sources, ready.landmarks)
+        return replace(ready.frame, images=images, masks=masks, uncertain=unsure)
 
     def _collect(self) -> None:
         """Make the dropped frames' slots free."""
@@ -354,7 +348,7 @@ class _Slots:
         self._layout = _Layout(order.task.setup.rig, order.keep_images)
         self._free = list(range(order.slots))
 
-    def put(self, observation: Observation, watch: Stopwatch) -> None:
+    def put(self, observation: Frame, watch: Stopwatch) -> None:
         """Hand a frame over; waits for a free slot."""
         while not self._free:
             self._free.append(self._tracker.recv())
@@ -364,17 +358,8 @@ class _Slots:
         masks[...] = observation.masks
         if observation.uncertain is not None:
             uncertain[...] = observation.uncertain
-        self._tracker.send(
-            _Ready(
-                number,
-                observation.index,
-                observation.time,
-                observation.uncertain is not None,
-                observation.sources,
-                observation.landmarks,
-                watch.laps,
-            )
-        )
+        bare = replace(observation, images=images[:0, :0], masks=masks[:0, :0], uncertain=None)
+        self._tracker.send(_Ready(number, bare, observation.uncertain is not None, watch.laps))
 
 
 def serve(descriptor: int) -> None:

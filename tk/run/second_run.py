@@ -22,7 +22,7 @@ from tk.model.cues.ray_costs import RayGrid, residual_of
 from tk.model.setup import InitPose, Setup, Subject
 from tk.trackers.camera_monitor import CameraMonitor
 from tk.trackers.contour_finder import SCREEN_ROWS
-from tk.trackers.protocol import Estimate, Observation, TwoPassTracker, shows_person
+from tk.trackers.protocol import Estimate, Frame, TwoPassTracker, shows_person
 
 Float = NDArray[np.float64]
 
@@ -143,7 +143,7 @@ def track_again(
     found: dict[int, Estimate] = {}
     with source.frames(begin, stop) as images:
         frames = (
-            Observation(
+            Frame(
                 frame.index,
                 frame.images,
                 masks.get(frame.index),

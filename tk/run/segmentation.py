@@ -14,7 +14,6 @@ from tk.io.captures.source import Source
 from tk.model.masks.background import median_plate
 from tk.model.masks.foreground import CollinearityForeground, Foreground
 from tk.model.masks.image_shift import exchanged_scenes
-from tk.model.masks.mog2 import Mog2Foreground
 from tk.run.learned_masks import MASK_SOURCES, LearnedMasks
 from tk.run.task import Task
 from tk.segmenters import INSTALL, load, names
@@ -25,9 +24,7 @@ class Labels(NamedTuple):
     """The masks of a frame set.
 
     Attributes:
-        masks, uncertain: as an :class:`~tk.trackers.protocol.Observation` has them.
-        sources: (C,) uint8, where a segmenter's masks come from, see :mod:`tk.run.learned_masks`; None for others.
-        landmarks: as an :class:`~tk.trackers.protocol.Observation` has them.
+        masks, uncertain, sources, landmarks: as a :class:`~tk.trackers.protocol.Frame` has them.
     """
 
     masks: NDArray[np.uint8]
@@ -154,8 +151,6 @@ def _against_scene(task: Task, clips: Sequence[NDArray[np.uint8]]) -> Labeller:
 def _learn(task: Task, clips: Sequence[NDArray[np.uint8]]) -> Foreground:
     setup, settings = task.setup, task.settings
     sizes = [(camera.width, camera.height) for camera in setup.rig]
-    if settings.segmentation == "mog2":
-        return Mog2Foreground.learn(clips, setup.rig.frame_shape, sizes)
     return CollinearityForeground.learn(clips, setup.rig.frame_shape, sizes, settings.foreground)
 
 

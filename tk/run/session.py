@@ -16,8 +16,8 @@ from tk.io.captures.capture import Capture
 from tk.io.captures.film import Film
 from tk.io.captures.mask_store import MaskStores
 from tk.io.results.files import check_result_path
-from tk.io.results.reader import read_people
-from tk.io.results.revision import revise_result
+from tk.io.results.reader import read_people, read_result
+from tk.io.results.revision import revise_people
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
 from tk.run.loop import Loop, Output
@@ -145,10 +145,11 @@ def track_task(
                     lines = [*task.source.damaged(plan.begin + done + loop.tracked, loop.people.doubted), *lines]
                 for line in lines:
                     note(line)
+                found = read_result(output).people
                 with one_thread():
-                    finish(output, task, loop.people, masks, note, reporter.within, loop.finished)
-                if said:
-                    revise_result(output, notes=said)
+                    finished = finish(found, task, loop.people, masks, note, reporter.within)
+                if said or finished.revisions:
+                    revise_people(output, finished.revisions, finished.cameras, said or None)
             stores.remove()
         except KeyboardInterrupt:
             # caught outside the writer, which then keeps an older result if no frame is finished

@@ -10,10 +10,8 @@ Only contour trackers can go without a camera: a visual hull without one of its 
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,22 +19,22 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError
 from tk.kernels.mask_values import OTHERS
 from tk.model.body.joint_sigma import VIEW_M
-from tk.model.body.plausibility import Plausibility, check_extent, check_stature
+from tk.model.body.plausibility import LastAccepted, Plausibility, check_extent, check_stature
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.landmark_agreement import evidence_for_cameras
-from tk.model.masks.image_health import MOVED, ImageHealth, described
+from tk.model.masks.image_health import MOVED, HealthState, ImageHealth, described
 from tk.model.masks.mask_agreement import Agreement, MaskAgreement
 from tk.model.setup import Setup, Subject
-from tk.trackers.protocol import Estimate, Observation, Tracker, sharing, shows_person, without_cameras
+from tk.model.stateful import Stateful
+from tk.trackers.protocol import Estimate, Frame, Tracker, sharing, shows_person, without_cameras
 from tk.trackers.region import RegionTracker
 from tk.trackers.residual import RATE
-from tk.trackers.residual_judge import ResidualJudge
+from tk.trackers.residual_judge import JudgeState, ResidualJudge
 
 Float = NDArray[np.float64]
 
 # Frames of the opening that are compared.
 _OPENING = 5
-_STATE = ("excluded", "refused", "was_lost")
 # Reasons, as in messages.
 _DISAGREES, _TOO_FEW = "disagrees with the others", "fewer than two cameras see anybody"
 _MISSING = "misses a part of the person"
@@ -47,12 +45,12 @@ Span = tuple[int, int, int]
 """Frames: the first, the last, and their number."""
 
 
-def spread_over(frames: Sequence[Observation], count: int = _OPENING) -> list[Observation]:
+def spread_over(frames: Sequence[Frame], count: int = _OPENING) -> list[Frame]:
     """Return this many of the opening's frames, spread over it."""
     return [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))]
 
 
-def opening_agreement(setup: Setup, frames: Sequence[Observation]) -> Agreement:
+def opening_agreement(setup: Setup, frames: Sequence[Frame]) -> Agreement:
     """Return whether the silhouettes of the opening frames agree.
 
     A network's masks have holes and contain pieces of other things. A camera whose masks contradict the others is right
@@ -65,7 +63,32 @@ def opening_agreement(setup: Setup, frames: Sequence[Observation]) -> Agreement:
     return found.confirmed(evidence_for_cameras(setup.rig, seen))
 
 
-class CameraMonitor:
+@dataclass(frozen=True)
+class MonitorState:
+    """What is known of C cameras and of the person.
+
+    Attributes:
+        excluded: (C,) cameras that are wrong.
+        refused: poses refused since the last accepted one, because of their residual.
+        was_lost: whether the last frame has no pose.
+        spans: of exclusion, by "camera/reason".
+        lost: losses and jumps, by reason.
+        opening_reasons: why cameras are excluded from the opening on.
+        health, plausibility, judge: the parts; None without a judge.
+    """
+
+    excluded: NDArray[np.bool_]
+    refused: int
+    was_lost: bool
+    spans: dict[str, Span]
+    lost: dict[str, Span]
+    opening_reasons: dict[int, str]
+    health: HealthState
+    plausibility: LastAccepted
+    judge: JudgeState | None
+
+
+class CameraMonitor(Stateful[MonitorState]):
     """Steps a tracker; excludes cameras that are wrong.
 
     Args:
@@ -73,6 +96,8 @@ class CameraMonitor:
         setup: rig, working volume, upward direction and rate.
         subject: what is known of the person.
     """
+
+    State = MonitorState
 
     def __init__(self, tracker: Tracker, setup: Setup, subject: Subject) -> None:
         self.tracker, self._setup, self._subject = tracker, setup, subject
@@ -83,14 +108,14 @@ class CameraMonitor:
         self.unfit = np.zeros(C, bool)  # cameras that their image excludes from the last frame
         self._excluded = np.zeros(C, bool)
         self._judge = ResidualJudge(tracker, setup.rig) if isinstance(tracker, RegionTracker) else None
-        self._spans: dict[str, Span] = {}  # of exclusion, by "camera/reason"
-        self._lost: dict[str, Span] = {}  # losses and jumps, by reason
+        self._spans: dict[str, Span] = {}
+        self._lost: dict[str, Span] = {}
         self._opening_reasons: dict[int, str] = {}
-        self._refused = np.zeros((), np.int64)  # poses refused since the last accepted one, because of their residual
-        self._was_lost = np.zeros((), bool)  # whether the last frame has no pose
+        self._refused = 0
+        self._was_lost = False
         self._excess = 0.0  # of this frame, mean over the cameras used; 0 if it was not tested
 
-    def start(self, frames: Sequence[Observation], whole: Sequence[Observation] = ()) -> list[Observation]:
+    def start(self, frames: Sequence[Frame], whole: Sequence[Frame] = ()) -> list[Frame]:
         """Return the opening frames without the cameras that are wrong, for the tracker's start.
 
         Args:
@@ -134,7 +159,7 @@ class CameraMonitor:
         if self._subject.height_m is None:
             check_stature(self.tracker.body.dimensions.stature)
 
-    def step(self, frame: Observation) -> tuple[Estimate, Observation]:
+    def step(self, frame: Frame) -> tuple[Estimate, Frame]:
         """Return the estimate for the next frame, and the observation without the excluded cameras."""
         unhealthy = self._health.look(frame.images, frame.masks, self._excluded)
         self.unfit = bad = self._bad(unhealthy)
@@ -156,7 +181,7 @@ class CameraMonitor:
         if estimate.status == "recovered" and not self._was_lost:
             _count(self._lost, _JUMPED, frame.index)
         estimate = self._plausible(frame.index, estimate, used)
-        self._was_lost = np.array(estimate.status == "lost")
+        self._was_lost = estimate.status == "lost"
         if self._judge is not None and estimate.status != "lost" and self._judge.contradicts(estimate):
             estimate = replace(estimate, status="suspect")
         return estimate, used
@@ -165,7 +190,7 @@ class CameraMonitor:
         """Return (C,) the cameras whose image excludes them. Trackers of hulls need all cameras."""
         return np.array([self.tracker.can_exclude_cameras and reason is not None for reason in unhealthy])
 
-    def _plausible(self, index: int, estimate: Estimate, used: Observation) -> Estimate:
+    def _plausible(self, index: int, estimate: Estimate, used: Frame) -> Estimate:
         """Return the estimate, with status lost if it is impossible."""
         if estimate.status == "lost":
             self._plausibility.forget()
@@ -177,9 +202,9 @@ class CameraMonitor:
         reason = self._plausibility.judge(index, estimate.joints)
         if reason is None and estimate.status == "recovered" and self._excess > self._accepted:
             reason = "after a loss its residual is still high"
-            self._refused = self._refused + 1
+            self._refused += 1
         if reason is None:
-            self._refused = np.zeros((), np.int64)
+            self._refused = 0
             return estimate
         _count(self._lost, f"{_IMPLAUSIBLE}: {reason}", index)
         self._plausibility.forget()
@@ -218,34 +243,6 @@ class CameraMonitor:
         outcome = {_TOO_FEW: "no pose", _JUMPED: "searched for again"}
         status = {reason: outcome.get(reason, "lost") for reason in self._lost}
         return lines + [f"{reason}: {status[reason]}, {described(*span)}" for reason, span in self._lost.items()]
-
-    def state(self) -> Mapping[str, Any]:
-        """Return what :meth:`restore` needs beside the tracker's own state."""
-        return {
-            **{name: getattr(self, f"_{name}") for name in _STATE},
-            **{f"health/{name}": value for name, value in self._health.state().items()},
-            **{f"plausibility/{name}": value for name, value in self._plausibility.state().items()},
-            **{f"judge/{name}": value for name, value in (self._judge.state() if self._judge else {}).items()},
-            "spans": json.dumps([self._spans, self._lost, self._opening_reasons]),
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state; the caller restores the tracker."""
-        part: dict[str, dict[str, Any]] = {"health": {}, "plausibility": {}, "judge": {}}
-        for name, value in state.items():
-            group, slash, rest = name.partition("/")
-            if slash and group in part:
-                part[group][rest] = value
-        for name in _STATE:
-            setattr(self, f"_{name}", np.array(state[name]))
-        self._health.restore(part["health"])
-        self._plausibility.restore(part["plausibility"])
-        if self._judge is not None:
-            self._judge.restore(part["judge"])
-        spans, lost, reasons = json.loads(str(state["spans"]))
-        self._spans = {key: (span[0], span[1], span[2]) for key, span in spans.items()}
-        self._lost = {key: (span[0], span[1], span[2]) for key, span in lost.items()}
-        self._opening_reasons = {int(camera): reason for camera, reason in reasons.items()}
 
 
 def _count(spans: dict[str, Span], key: str, index: int) -> None:

@@ -118,10 +118,11 @@ class ContourFinder:
 
     def take_body(self, body: ConeBody) -> None:
         """Use this body from now on; the learned colours are kept."""
-        known = self.colors.state() if self._body is not None else {}
+        known = self.colors.state if self._body is not None else None
         self._body = body = body.standing("z")
         self.colors = PartColors(body)
-        self.colors.restore(known)
+        if known is not None:
+            self.colors.state = known
         self.limbs = limbs_of(body)
 
     def prepare(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +13,16 @@ from tk.errors import CaptureError
 from tk.kernels.mask_values import PERSON
 from tk.model.body import gait_poses as gait
 from tk.model.body.stored_body import restore_body
-from tk.model.cues.part_colors import PartColors, RenderedBody, color_bins
+from tk.model.cues.part_colors import LearnedColors, PartColors, RenderedBody, color_bins
 from tk.model.masks.silhouettes import Pyramid
 from tk.model.setup import Subject
+from tk.model.stateful import Stateful
 from tk.trackers.contour_finder import ContourFinder
 from tk.trackers.initialisation import HEADINGS, PHASES, centroid
-from tk.trackers.protocol import Estimate, Observation
+from tk.trackers.protocol import Estimate, Frame
 
 Float = NDArray[np.float64]
+S = TypeVar("S")
 
 # As long as a person stays lost, the search from the centroid of the silhouettes runs once in so many frames.
 RECOVER_EVERY = 3
@@ -34,7 +36,7 @@ FACING = 0.04
 WRONG = 0.1
 
 
-class ContourTracker(ContourFinder, ABC):
+class ContourTracker(ContourFinder, Stateful[S], ABC):
     """Base class of the region and the silhouette tracker.
 
     All poses are in the tracker's own world, except those that go in or out by the protocol
@@ -52,33 +54,20 @@ class ContourTracker(ContourFinder, ABC):
     _lost_for: int  # consecutive frames, up to the last one, in which the person was lost
 
     @abstractmethod
-    def start(self, frames: Sequence[Observation], subject: Subject) -> None:
+    def start(self, frames: Sequence[Frame], subject: Subject) -> None:
         """Find the subject in the first frame and fit the body to all of them, see :meth:`ContourFinder.find`."""
 
     @abstractmethod
-    def step(self, frame: Observation) -> Estimate:
+    def step(self, frame: Frame) -> Estimate:
         """Return the estimate for the next frame."""
 
     @abstractmethod
     def last_poses(self) -> tuple[Float, Float]:
         """Return the poses (D,) of the last frame and of the frame before."""
 
-    @abstractmethod
-    def rewind(self, state: Mapping[str, Any]) -> None:
-        """Go back to a state."""
-
-    def state(self) -> Mapping[str, Any]:
-        """Return what :meth:`restore` needs, beside the model, to continue after the last frame.
-
-        Poses are stored in tracker coordinates, so that a resumed run has the same bits; ``world`` (3, 4) transforms
-        them to the capture's world.
-        """
-        return {"world": np.column_stack([self.world.rotation, self.world.origin])}
-
-    def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
-        """Continue a run from its model and state."""
+    def take_model(self, model: Mapping[str, Any]) -> None:
+        """Take the body of a run."""
         self.take_body(restore_body(model))
-        self.rewind(state)
 
     def lose(self) -> None:
         """Take the last frame for lost: the person is searched for in the next one."""
@@ -92,25 +81,23 @@ class ContourTracker(ContourFinder, ABC):
         met = self.choice.render(self.body, pose[None])
         return RenderedBody(met.label[0], met.depth[0], self.body.color_group, self.colors.log_likelihood)
 
-    def learned(self) -> Mapping[str, Any]:
-        """Return the learned colours, a part of the state."""
-        return self.colors.state()
+    def learned(self) -> LearnedColors | None:
+        """Return the learned colours, a part of the state; None before any are known."""
+        return self.colors.state if self.colors.known else None
 
-    def likeness(
-        self, frame: Observation, learned: Mapping[str, Any] | None = None, pose: Float | None = None
-    ) -> float:
+    def likeness(self, frame: Frame, learned: LearnedColors | None = None, pose: Float | None = None) -> float:
         """Return the log-likelihood, mean per pixel, that a frame shows this person; about 0 or less.
 
         Args:
             frame: the observation of a person.
-            learned: colours of this person, see :meth:`PartColors.state`; None: the present ones.
+            learned: colours of this person; None: the present ones.
             pose: (D,) the person's pose, in the tracker's frame. With it, the body counts, too: a pixel is wrong with
                 the probability :data:`WRONG`.
         """
         colors = self.colors
         if learned is not None:
             colors = PartColors(self.body)
-            colors.restore(learned)
+            colors.state = learned
         by_color = 0.0
         if frame.images.size:
             bins = color_bins(self.choice.sample(frame.images))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ if TYPE_CHECKING:  # the process that decodes and segments needs no parts of a t
     from tk.model.body.cone_body import ConeBody
     from tk.model.cameras.camera import Rig
     from tk.model.cameras.tracker_frame import TrackerFrame
-    from tk.model.cues.part_colors import RenderedBody
+    from tk.model.cues.part_colors import LearnedColors, RenderedBody
     from tk.model.cues.ray_costs import RayGrid
     from tk.model.hull.hull import HullSurface
     from tk.model.masks.silhouettes import Views
@@ -27,8 +27,8 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Observation:
-    """Images and masks of all cameras at one time, for one subject.
+class Frame:
+    """One time index: images, masks and landmarks of all cameras, for one subject.
 
     Attributes:
         index: number of the frame in its source.
@@ -52,6 +52,9 @@ class Observation:
     landmarks: NDArray[np.float64] | None = None
 
 
+Observation = Frame  # its former name, in modules that are changed at the moment
+
+
 @dataclass(frozen=True)
 class Estimate:
     """A tracker's answer for one frame.
@@ -61,7 +64,7 @@ class Estimate:
         joints: (J, 3) joint centres, metres. Pose and joints are NaN before anybody is tracked.
         status: "tracked", "initialised", "recovered", "lost", "suspect" (by the camera monitor), or "absent" (by the
             run: nobody is there).
-        objective: the objective's final value; the region tracker gives the running mean of its cost.
+        objective: the objective's final value; of contour trackers E_S, mean over the views.
         iterations: (S,) optimiser iterations by stage; for ``search`` 1 if limbs were searched, else 0.
         timing: seconds by stage.
         surface: the hull's surface, if the tracker made one.
@@ -72,8 +75,8 @@ class Estimate:
         masks: (C, H, W) uint8, what the tracker took for the person, cleaned; None where that is the observation's, and
             in what :func:`tk.track` hands out. drawn: (C, h, w) bool, where the body is on the tracker's grid of rays,
             cameras left out included; None likewise.
-        mask_source: (C,) uint8, as ``Observation.sources``.
-        landmarks: (C, L, 3) those of this person among ``Observation.landmarks``; None if there are none.
+        mask_source: (C,) uint8, as ``Frame.sources``.
+        landmarks: (C, L, 3) those of this person among ``Frame.landmarks``; None if there are none.
         frame, time: the frame's number in the capture, and seconds; whoever steps the tracker knows them.
         person: the person's number in the run.
     """
@@ -97,9 +100,10 @@ class Estimate:
 
 
 class Tracker(Protocol):
-    """Tracks one subject from frame to frame. Poses are those of the setup's world, except in :meth:`state`.
+    """Tracks one subject from frame to frame. Poses are those of the setup's world, except in :attr:`state`.
 
     Attributes:
+        State, state: a frozen dataclass, and what changes from frame to frame, see :class:`tk.model.stateful.Stateful`.
         method: name in :data:`tk.trackers.registry.METHODS`.
         stages, timing_stages: names of the entries of ``Estimate.iterations``, and of ``Estimate.timing``.
         pose_names, pose_units: (D,) names and units of the entries of the pose vector.
@@ -112,6 +116,8 @@ class Tracker(Protocol):
         tracks_among_others: whether it is a :class:`SharingTracker`. A visual hull needs whole masks.
     """
 
+    State: ClassVar[type[Any]]
+    state: Any
     method: str
     stages: tuple[str, ...]
     timing_stages: tuple[str, ...]
@@ -137,14 +143,14 @@ class Tracker(Protocol):
 
     @property
     def body(self) -> ConeBody:
-        """The subject's body; only after :meth:`start` or :meth:`restore`."""
+        """The subject's body; only after :meth:`start` or :meth:`take_model`."""
         ...
 
     def prepare(self) -> None:
         """Compile kernels while there is nothing else to do."""
         ...
 
-    def start(self, frames: Sequence[Observation], subject: Subject) -> None:
+    def start(self, frames: Sequence[Frame], subject: Subject) -> None:
         """Find the subject in the first of ``frames`` and fit the body. The first :meth:`step` is for that frame, too.
 
         Args:
@@ -153,7 +159,7 @@ class Tracker(Protocol):
         """
         ...
 
-    def step(self, frame: Observation) -> Estimate:
+    def step(self, frame: Frame) -> Estimate:
         """Estimate the pose in the next frame."""
         ...
 
@@ -161,17 +167,13 @@ class Tracker(Protocol):
         """Return the fitted body, for `/model` of the result."""
         ...
 
-    def state(self) -> Mapping[str, Any]:
-        """Return everything that changes from frame to frame."""
-        ...
-
-    def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
-        """Continue where a run with this model and state stopped."""
+    def take_model(self, model: Mapping[str, Any]) -> None:
+        """Take the body of a run; the caller then sets the state."""
         ...
 
 
 class SharingTracker(Tracker, Protocol):
-    """A tracker that does without the pixels of other people, see :class:`Observation`.
+    """A tracker that does without the pixels of other people, see :class:`Frame`.
 
     Attributes:
         choice: the grid on which its body is rendered.
@@ -189,23 +191,17 @@ class SharingTracker(Tracker, Protocol):
         """Return the poses (D,) of the last frame and of the frame before, in the tracker's frame."""
         ...
 
-    def learned(self) -> Mapping[str, Any]:
-        """Return the learned colours, a part of the state; empty before any are known."""
+    def learned(self) -> LearnedColors | None:
+        """Return the learned colours, the field ``colors`` of the state; None before any are known."""
         ...
 
-    def likeness(
-        self, frame: Observation, learned: Mapping[str, Any] | None = None, pose: Float | None = None
-    ) -> float:
+    def likeness(self, frame: Frame, learned: LearnedColors | None = None, pose: Float | None = None) -> float:
         """Return the log-likelihood, mean per pixel, that a frame shows this person: by the colours, and by the body if
         a pose (D,) is given."""
         ...
 
     def lose(self) -> None:
         """Take the last frame for lost: the person is searched for in the next one."""
-        ...
-
-    def rewind(self, state: Mapping[str, Any]) -> None:
-        """Go back to a state."""
         ...
 
 
@@ -220,7 +216,7 @@ class TwoPassTracker(Tracker, Protocol):
         """Return masks (C, H, W) without specks and small holes, as :meth:`second_pass` takes them."""
         ...
 
-    def without_foreign(self, frame: Observation) -> Observation:
+    def without_foreign(self, frame: Frame) -> Frame:
         """Return the frame without things in its masks that are not the person."""
         ...
 
@@ -293,7 +289,7 @@ def shows_person(masks: NDArray[np.uint8]) -> NDArray[np.bool_]:
     return np.asarray(masks.reshape(len(masks), -1).max(axis=1) >= PERSON)
 
 
-def without_cameras(frame: Observation, out: NDArray[np.bool_]) -> Observation:
+def without_cameras(frame: Frame, out: NDArray[np.bool_]) -> Frame:
     """Return the frame with empty masks in some cameras (C,)."""
     if not out.any():
         return frame

@@ -16,9 +16,9 @@ resolution: every part should lie in all silhouettes, and every ray of a silhoue
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -33,7 +33,7 @@ from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import determine_depth
 from tk.model.cues.landmarks import contradiction, propose
-from tk.model.cues.part_colors import color_bins
+from tk.model.cues.part_colors import LearnedColors, color_bins
 from tk.model.cues.ray_costs import Evidence
 from tk.model.cues.visible_contours import contour_shares
 from tk.model.masks.mosaic import doubled
@@ -48,7 +48,7 @@ from tk.trackers.contour_tracker import RECOVER_EVERY, ContourTracker
 from tk.trackers.hypotheses import DROPPED, PATIENCE, RENEWAL, Hypothesis, disagreement
 from tk.trackers.limb_search import SAME_POSE_M
 from tk.trackers.protocol import Estimate, Observation, Stopwatch
-from tk.trackers.residual import ResidualBaseline, variance_factor
+from tk.trackers.residual import BaselineState, ResidualBaseline, variance_factor
 from tk.trackers.second_pass import STATURE, SecondPass
 
 Float = NDArray[np.float64]
@@ -103,13 +103,40 @@ class _Look(NamedTuple):
         return np.asarray(self.residual.sum(axis=1))
 
 
-class RegionTracker(ContourTracker):
+@dataclass(frozen=True)
+class RegionState:
+    """What changes from frame to frame. Poses are in the tracker's own world.
+
+    Attributes:
+        alive: the hypotheses, best first.
+        residuals, colors: what has been learned.
+        mean_posture, postures: (J, 3) mean directions, of this number of frames.
+        lost_for, high_for: consecutive frames in which the person was lost, and with a high residual.
+        view_m: see :class:`RegionTracker`.
+        heading_known: whether landmarks have shown it.
+        fresh: whether no frame has been tracked yet.
+    """
+
+    alive: list[Hypothesis]
+    residuals: BaselineState
+    colors: LearnedColors
+    mean_posture: Float
+    postures: int
+    lost_for: int
+    high_for: int
+    view_m: float
+    heading_known: bool
+    fresh: bool
+
+
+class RegionTracker(ContourTracker[RegionState]):
     """Tracks one person. :meth:`start` once, then :meth:`step` for every frame, the first included.
 
     Attributes:
         view_m: displacement of a bone's contours in one view, metres; larger if the calibration is doubtful.
     """
 
+    State = RegionState
     method = "region"
     stages: tuple[str, ...] = ("contours", "search")
     timing_stages: tuple[str, ...] = ("masks_clean", "optimise", "check", "search")
@@ -137,7 +164,7 @@ class RegionTracker(ContourTracker):
         self._mean_posture: Float = np.zeros((len(JOINTS), 3))
         self._postures = 0
         self._fresh = True
-        self._heading_known = False  # landmarks have shown it
+        self._heading_known = False
         self.view_m = VIEW_M
         self._reset()
 
@@ -498,41 +525,10 @@ class RegionTracker(ContourTracker):
             residual=np.full((len(frame.masks), 2), np.nan),
         )
 
-    def state(self) -> Mapping[str, Any]:
-        return {
-            **super().state(),
-            "poses": np.array([h.pose for h in self._alive]),
-            "previous": np.array([h.previous for h in self._alive]),
-            "costs": np.array([h.cost for h in self._alive]),
-            "ages": np.array([h.age for h in self._alive]),
-            "jumped": np.array([h.jumped for h in self._alive]),
-            **self.residuals.state(),
-            "mean_posture": self._mean_posture.copy(),
-            "postures": self._postures,
-            "lost_for": self._lost_for,
-            "high_for": self._high_for,
-            "view_m": self.view_m,
-            "heading_known": self._heading_known,
-            **self.colors.state(),
-        }
-
-    def rewind(self, state: Mapping[str, Any]) -> None:
-        rows = zip(*(np.array(state[name]) for name in ("poses", "previous", "costs", "ages", "jumped")), strict=True)
-        self._alive = [Hypothesis(p, q, float(c), int(a), bool(j)) for p, q, c, a, j in rows]
-        self.residuals.restore(state)
-        self._mean_posture = np.array(state["mean_posture"], np.float64)
-        self._postures = int(state["postures"])
-        self._lost_for = int(state["lost_for"])
-        self._high_for = int(state["high_for"])
-        self.view_m = float(state["view_m"])
-        self._heading_known = bool(state["heading_known"])
-        self.colors.restore(state)
-        self._fresh = False
-
     def with_cameras(self, rig: Rig) -> RegionTracker:
         """Return a tracker of the same body and colours with other cameras."""
         fresh = RegionTracker(rig, self.up, self.contours, self.config, self.fps, self.seed)
         fresh.take_body(self.body)
         fresh.view_m = self.view_m
-        fresh.colors.restore(self.colors.state())
+        fresh.colors.state = self.colors.state
         return fresh

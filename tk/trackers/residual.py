@@ -11,12 +11,13 @@ area: a body in the wrong place has both, a torn mask has only missing area, and
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import dataclass
 from statistics import NormalDist
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tk.model.stateful import Stateful
 
 Float = NDArray[np.float64]
 
@@ -84,7 +85,16 @@ def contradicted(residual: Float, false_alarm: float) -> NDArray[np.bool_]:
     return result
 
 
-class ResidualBaseline:
+@dataclass(frozen=True)
+class BaselineState:
+    """(V,) mean and spread of E_S in each view, and the number of frames without a high residual."""
+
+    mean: Float
+    spread: Float
+    frames: NDArray[np.int64]
+
+
+class ResidualBaseline(Stateful[BaselineState]):
     """Running mean and spread of the residual of each of V views.
 
     Args:
@@ -95,6 +105,8 @@ class ResidualBaseline:
         threshold: the excess, in spreads, that a normal variable exceeds with this probability.
         mean, spread: (V,) of E_S; the mean is NaN for a view that has seen nobody yet.
     """
+
+    State = BaselineState
 
     def __init__(self, views: int, false_alarm: float) -> None:
         self.threshold = NormalDist().inv_cdf(1.0 - false_alarm)
@@ -151,13 +163,3 @@ class ResidualBaseline:
         spread = self.spread + RATE * (1.25 * np.abs(deviation) - self.spread)
         self.mean = np.where(seen, mean, self.mean)
         self.spread = np.where(right, np.maximum(spread, np.maximum(LEAST_SPREAD, LEAST_SHARE * mean)), self.spread)
-
-    def state(self) -> Mapping[str, Any]:
-        """Return what :meth:`restore` needs."""
-        return {"residual_mean": self.mean, "residual_spread": self.spread, "residual_frames": self._frames}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state."""
-        self.mean = np.array(state["residual_mean"], np.float64)
-        self.spread = np.array(state["residual_spread"], np.float64)
-        self._frames = np.array(state["residual_frames"], np.int64)

@@ -13,9 +13,7 @@ the pose is not rejected because of it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +22,8 @@ from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import determine_depth
 from tk.model.cues.ray_costs import residual_of
-from tk.trackers.protocol import Estimate, Observation, shows_person, without_cameras
+from tk.model.stateful import Stateful
+from tk.trackers.protocol import Estimate, Frame, shows_person, without_cameras
 from tk.trackers.region import RegionTracker
 from tk.trackers.residual import OUTLIER, RECENT, contradicted
 
@@ -41,10 +40,28 @@ _TORN = 0.5
 # after which a camera is tested again that was found right. With half and twice the value no mean error of dance and
 # cube (50 frames) changes; their cameras are right.
 _WHOLE = _PAUSE = 6
-_STATE = ("torn", "_normal_for", "_since_test", "_at_test", "_recent")
 
 
-class ResidualJudge:
+@dataclass(frozen=True)
+class JudgeState:
+    """Of C cameras.
+
+    Attributes:
+        torn: (C,) whether a camera is excluded because of a torn mask.
+        normal_for: (C,) consecutive frames with a normal residual.
+        since_test: (C,) frames since the last test.
+        at_test: (C,) excess at the last test.
+        recent: (RECENT, C, 2) residuals of the last frames.
+    """
+
+    torn: Bool
+    normal_for: NDArray[np.int64]
+    since_test: NDArray[np.int64]
+    at_test: Float
+    recent: Float
+
+
+class ResidualJudge(Stateful[JudgeState]):
     """Steps a tracker; judges cameras and poses by their residuals.
 
     Args:
@@ -55,18 +72,18 @@ class ResidualJudge:
         torn: (C,) whether a camera is excluded because of a torn mask.
     """
 
+    State = JudgeState
+
     def __init__(self, tracker: RegionTracker, rig: Rig) -> None:
         C = len(rig)
         self.tracker, self._rig = tracker, rig
         self.torn = np.zeros(C, bool)
-        self._normal_for = np.zeros(C, np.int64)  # consecutive frames with a normal residual
+        self._normal_for = np.zeros(C, np.int64)
         self._since_test = np.full(C, _PAUSE)
-        self._at_test = np.zeros(C)  # excess at the last test
-        self._recent = np.full((RECENT, C, 2), np.nan)  # residuals of the last frames
+        self._at_test = np.zeros(C)
+        self._recent = np.full((RECENT, C, 2), np.nan)
 
-    def step(
-        self, frame: Observation, used: Observation, bad: Bool, excluded: Bool
-    ) -> tuple[Estimate, Observation, float]:
+    def step(self, frame: Frame, used: Frame, bad: Bool, excluded: Bool) -> tuple[Estimate, Frame, float]:
         """Step the tracker; exclude a camera that is wrong, and include those again that are right.
 
         Args:
@@ -80,7 +97,7 @@ class ResidualJudge:
             cameras used, 0 if none shows anybody.
         """
         tracker = self.tracker
-        before = tracker.state()
+        before = tracker.state
         first = tracker.step(used)
         if first.residual is None or not shows_person(used.masks).any():
             return first, used, 0.0
@@ -101,9 +118,9 @@ class ResidualJudge:
             worst = int(np.argmax(np.where(suspects, excess, -np.inf)))
             others = kept.copy()
             others[worst] = False
-            after = tracker.state()
+            after = tracker.state
             fewer = without_cameras(used, ~others)
-            tracker.rewind(before)
+            tracker.state = before
             second = tracker.step(fewer)
             residual = self._residual(frame, second)
             if self._is_wrong(worst, residual, error, others, second.joints):
@@ -112,7 +129,7 @@ class ResidualJudge:
                 estimate, used, kept = replace(second, status=first.status), fewer, others
                 error = residual.sum(axis=1)
             else:
-                tracker.rewind(after)
+                tracker.state = after
                 self._since_test[worst], self._at_test[worst] = 0, excess[worst]
         excluded &= ~back
         return estimate, used, tracker.residuals.mean_excess(np.where(kept, error, np.nan))
@@ -138,7 +155,7 @@ class ResidualJudge:
         surplus = many and baseline.excess(error)[camera] > OUTLIER and relief > 1.0
         return bool(missing or surplus or error[camera] > _UNRELATED)
 
-    def _residual(self, frame: Observation, estimate: Estimate) -> Float:
+    def _residual(self, frame: Frame, estimate: Estimate) -> Float:
         """Return (C, 2) missing and surplus area at the estimate's pose, of excluded cameras, too. Missing area on
         uncertain pixels is not counted if enough of the mask is left. NaN where a camera sees nobody, or no body was
         fitted.
@@ -169,12 +186,3 @@ class ResidualJudge:
             return False
         self._recent = np.concatenate([self._recent[1:], estimate.residual[None]])
         return bool(contradicted(self._recent, self.tracker.config.false_alarm)[-1])
-
-    def state(self) -> Mapping[str, Any]:
-        """Return what :meth:`restore` needs beside the tracker's own state."""
-        return {name: getattr(self, name) for name in _STATE}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state; the caller restores the tracker."""
-        for name in _STATE:
-            setattr(self, name, np.array(state[name]))

@@ -27,7 +27,7 @@ from tk.kernels.raycast import FAR
 from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import RenderedBody, color_bins
 from tk.model.cues.ray_costs import RayGrid
-from tk.trackers.protocol import Observation
+from tk.trackers.protocol import Frame
 
 Float = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -65,19 +65,19 @@ class PixelOwners:
     owner: NDArray[np.int8]
     people: int  # number of people, also those whose body is unknown
 
-    def share(self, frame: Observation, person: int, unknown: bool = False) -> Observation:
+    def share(self, frame: Frame, person: int, unknown: bool = False) -> Frame:
         """Return the observation of a person, with the pixels of others as :data:`~tk.kernels.mask_values.OTHERS`.
 
         ``unknown``: pixels of somebody unknown may show this person.
         """
         return replace(frame, masks=self._masks(frame, (person, NOBODY) if unknown else (person,)))
 
-    def unknown(self, frame: Observation) -> Observation:
+    def unknown(self, frame: Frame) -> Frame:
         """Return the observation of people who are unknown; pixels of known people are
         :data:`~tk.kernels.mask_values.OTHERS`."""
         return replace(frame, masks=self._masks(frame, (NOBODY,)))
 
-    def _masks(self, frame: Observation, kept: Sequence[int]) -> NDArray[np.uint8]:
+    def _masks(self, frame: Frame, kept: Sequence[int]) -> NDArray[np.uint8]:
         """Return a frame's masks; pixels of other owners than ``kept`` are OTHERS."""
         masks = frame.masks.copy()
         for mask, owner in zip(masks, self.owner, strict=True):
@@ -123,7 +123,7 @@ class _Shape(NamedTuple):
 
 
 def assign(
-    rig: Rig, grid: RayGrid, bodies: Sequence[RenderedBody | None], frame: Observation, unknown: float = UNKNOWN
+    rig: Rig, grid: RayGrid, bodies: Sequence[RenderedBody | None], frame: Frame, unknown: float = UNKNOWN
 ) -> PixelOwners:
     """Return the owner of each pixel of the masks.
 

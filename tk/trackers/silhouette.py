@@ -10,9 +10,8 @@ or behind the trunk, and when the arm reappears, no contour may be near it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,14 +23,26 @@ from tk.optim.gauss_newton import GaussNewtonSettings
 from tk.settings import Settings, SilhouetteSettings
 from tk.trackers.contour_finder import LINE_SEARCH, SOLVER
 from tk.trackers.contour_tracker import RECOVER_EVERY, ContourTracker
-from tk.trackers.protocol import Estimate, Observation, Stopwatch
+from tk.trackers.protocol import Estimate, Frame, Stopwatch
 
 Float = NDArray[np.float64]
 
 
-class SilhouetteTracker(ContourTracker):
+@dataclass(frozen=True)
+class SilhouetteState:
+    """(D,) poses of the last frame and of the one before; consecutive frames in which the person was lost; whether no
+    frame has been tracked yet."""
+
+    pose: Float
+    previous: Float
+    lost_for: int
+    fresh: bool
+
+
+class SilhouetteTracker(ContourTracker[SilhouetteState]):
     """Tracks one person. :meth:`start` once, then :meth:`step` for every frame, the first included."""
 
+    State = SilhouetteState
     method = "silhouette"
     timing_stages: tuple[str, ...] = ("masks_clean", "optimise", "check")
 
@@ -56,12 +67,12 @@ class SilhouetteTracker(ContourTracker):
         self._lost_for = 0
         self._fresh = True
 
-    def start(self, frames: Sequence[Observation], subject: Subject) -> None:
+    def start(self, frames: Sequence[Frame], subject: Subject) -> None:
         self._pose = self._previous = self.find([_blind(f) for f in frames], subject)
         self._lost_for = 0
         self._fresh = True
 
-    def step(self, frame: Observation) -> Estimate:
+    def step(self, frame: Frame) -> Estimate:
         watch = Stopwatch()
         config = self.contours
         pyramid = self.pyramid(frame)
@@ -97,15 +108,7 @@ class SilhouetteTracker(ContourTracker):
     def last_poses(self) -> tuple[Float, Float]:
         return self._pose, self._previous
 
-    def state(self) -> Mapping[str, Any]:
-        return {**super().state(), "pose": self._pose, "previous": self._previous, "lost_for": self._lost_for}
 
-    def rewind(self, state: Mapping[str, Any]) -> None:
-        self._pose, self._previous = (np.array(state[name]) for name in ("pose", "previous"))
-        self._lost_for = int(state["lost_for"])
-        self._fresh = False
-
-
-def _blind(frame: Observation) -> Observation:
+def _blind(frame: Frame) -> Frame:
     """Return the frame without images: this tracker does not use colours."""
     return replace(frame, images=frame.images[:0])

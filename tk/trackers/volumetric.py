@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -35,11 +36,12 @@ from tk.model.cues.edge_term import ContourTerm
 from tk.model.cues.objective import NEAR_M, BodyObjective, Fit, FrameObjective
 from tk.model.hull.hull import HullSurface, VisualHull
 from tk.model.setup import Setup, Subject
+from tk.model.stateful import Stateful
 from tk.optim import schedule
 from tk.optim.smd import MAX_ITERATIONS
 from tk.settings import Settings
 from tk.trackers.contour_finder import ContourFinder
-from tk.trackers.protocol import Estimate, Observation, Stopwatch
+from tk.trackers.protocol import Estimate, Frame, Stopwatch
 
 Float = NDArray[np.float64]
 
@@ -64,7 +66,19 @@ def points_and_iterations(effort: float) -> tuple[int, int]:
     return max(round(effort), 1), max(round(min(effort, 1.0) * MAX_ITERATIONS), 1)
 
 
-class VolumetricTracker:
+@dataclass(frozen=True)
+class VolumetricState:
+    """(D,) poses of the last frame and of the one before; consecutive frames in which the person was lost; whether no
+    frame has been tracked yet; colours."""
+
+    pose: Float
+    previous: Float
+    lost_for: int
+    fresh: bool
+    appearance: Appearance
+
+
+class VolumetricTracker(Stateful[VolumetricState]):
     """Tracks one person. :meth:`start` once, then :meth:`step` for every frame, the first included.
 
     Args:
@@ -77,6 +91,7 @@ class VolumetricTracker:
         VolumeError: no two cameras see the volume.
     """
 
+    State = VolumetricState
     method = "volumetric"
     stages: tuple[str, ...] = ("all", *CHAINS)
     timing_stages: tuple[str, ...] = ("hull", "surface", "colour", "optimise", "update")
@@ -115,14 +130,14 @@ class VolumetricTracker:
         """Compile the kernels of the initialisation ahead of its first frame."""
         self._finder.prepare()
 
-    def start(self, frames: Sequence[Observation], subject: Subject) -> None:
+    def start(self, frames: Sequence[Frame], subject: Subject) -> None:
         """Find the subject in the first frame and fit the body to all frames, see :meth:`ContourFinder.find`.
 
         Raises:
             CaptureError: the volume is empty.
         """
         # without images: colours inside the silhouettes are a cue of the region tracker only
-        blind = [Observation(f.index, f.images[:0], f.masks) for f in frames]
+        blind = [Frame(f.index, f.images[:0], f.masks) for f in frames]
         pose = self._finder.find(blind, subject)
         first = frames[0]
         self.hull.update(first.masks)
@@ -148,7 +163,7 @@ class VolumetricTracker:
 
     # --- tracking (section 6.4) ---------------------------------------------------------------------------------
 
-    def step(self, frame: Observation) -> Estimate:
+    def step(self, frame: Frame) -> Estimate:
         """Track the next frame."""
         watch = Stopwatch()
         config = self.config
@@ -201,7 +216,7 @@ class VolumetricTracker:
         return schedule.optimise(problem, starts, self.iterations)
 
     def _search_limbs(
-        self, frame: Observation, problem: FrameObjective, found: schedule.ScheduleResult
+        self, frame: Frame, problem: FrameObjective, found: schedule.ScheduleResult
     ) -> schedule.ScheduleResult:
         """Search other poses of the limbs by contours; return the result from there if its objective is lower.
 
@@ -209,7 +224,7 @@ class VolumetricTracker:
         """
         finder = self._finder
         # without images: colours inside the silhouettes are a cue of the region tracker only
-        blind = Observation(frame.index, frame.images[:0], frame.masks, frame.uncertain)
+        blind = Frame(frame.index, frame.images[:0], frame.masks, frame.uncertain)
         pyramid = finder.pyramid(blind)
         converged = finder.settle(pyramid, self._to_contours(found.pose)[None]).states[0]
         candidates, _ = finder.search(blind, pyramid, finder.evidence(finder.screen, blind, pyramid), converged)
@@ -262,7 +277,7 @@ class VolumetricTracker:
         chain = 1 + CHAIN_OF_SEGMENT[self.skin.segment[fit.frame.even[0]]]
         return bool((np.bincount(chain, fit.unmatched) > LOST_SHARE * np.bincount(chain)).any())
 
-    def _nothing_seen(self, frame: Observation, surface: HullSurface, watch: Stopwatch) -> Estimate:
+    def _nothing_seen(self, frame: Frame, surface: HullSurface, watch: Stopwatch) -> Estimate:
         """Return the last pose with status "lost": the volume is empty."""
         self._previous = self._pose
         self._lost_for += 1
@@ -303,25 +318,7 @@ class VolumetricTracker:
             "patches/known": self._appearance.known.astype(np.uint8),
         }
 
-    def state(self) -> Mapping[str, Any]:
-        """Return the values that :meth:`restore` needs, beside the model, to continue after the last frame."""
-        return {
-            "pose": self._pose,
-            "previous": self._previous,
-            "lost_for": self._lost_for,
-            "mean_yuv": self._appearance.mean,
-        }
-
-    def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
-        """Continue a run that stopped with this model and state."""
+    def take_model(self, model: Mapping[str, Any]) -> None:
+        """Take the body of a run."""
         self._finder.take_body(restore_body(model))
         self._build()
-        self._appearance = Appearance(
-            np.asarray(state["mean_yuv"]),
-            np.asarray(model["patches/deviation_yuv"]),
-            np.asarray(model["patches/known"]).astype(bool),
-        )
-        self._pose = np.asarray(state["pose"])
-        self._previous = np.asarray(state["previous"])
-        self._lost_for = int(state["lost_for"])
-        self._fresh = False

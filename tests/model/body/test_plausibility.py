@@ -49,7 +49,7 @@ def test_after_a_loss_the_person_may_be_anywhere() -> None:
 def test_state_is_restored() -> None:
     judge, again = Plausibility(15.0), Plausibility(15.0)
     judge.judge(4, joints())
-    again.restore(judge.state())
+    again.state = judge.state
     for told in (joints(x=3.0), joints(x=0.1)):
         assert again.judge(5, told) == judge.judge(5, told)
 

@@ -46,7 +46,7 @@ def test_bins_have_sixteen_levels_of_each_channel(b, g, r):
 
 def test_likelihoods_are_uniform_before_learning():
     colors = PartColors(BODY)
-    assert not colors.known and colors.state() == {}
+    assert not colors.known and colors.state.counts is None
     assert colors.regions(np.zeros((2, 4, 4, 3), np.uint8)) is None
     assert colors.mismatch.shape == (COLOR_BINS, len(COLOR_GROUPS)) and not colors.mismatch.any()
 
@@ -94,12 +94,12 @@ def test_new_colors_are_learned_slowly():
 def test_state_round_trip():
     first, second = PartColors(BODY), PartColors(BODY)
     clothed(first)
-    state = {name: np.array(value) for name, value in first.state().items()}
-    second.restore(state)
+    second.state = first.state
     np.testing.assert_array_equal(second.log_likelihood, first.log_likelihood)
     for colors in (first, second):
         clothed(colors, seed=1)
     np.testing.assert_array_equal(second.mismatch, first.mismatch)
     untouched = PartColors(BODY)
-    untouched.restore(PartColors(BODY).state())
+    clothed(untouched)
+    untouched.state = PartColors(BODY).state
     assert not untouched.known

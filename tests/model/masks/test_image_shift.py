@@ -96,7 +96,7 @@ def test_each_camera_is_measured_in_its_turn_also_after_a_restart() -> None:
     shift.look(images, masks)
     images[1] = view((8.0, 0.0))
     moved = [W * shift.look(images, masks)]
-    again.restore(shift.state())
+    again.state = shift.state
     moved += [(again.look(images, masks), W * again.look(images, masks))[1] for _ in range(2)]
     np.testing.assert_allclose(moved, [[0.0, 0.0, 0.0], [0.0, 8.0, 0.0], [0.0, 8.0, 0.0]], atol=0.2)
 

@@ -19,8 +19,6 @@ from tk.io.captures.capture_toml import CaptureSettings, GivenSubject, read_sett
 from tk.io.captures.clip import Clip, Image
 from tk.io.captures.clip_folder import list_clips, names_in, probe
 from tk.io.captures.frames import FrameReader, FrameSet
-from tk.io.captures.mobo import SETTINGS as MOBO_SETTINGS
-from tk.io.captures.mobo import find_walk, read_cameras
 from tk.io.captures.pictures import PictureClip, picture_number
 from tk.io.captures.timing import check_clock, read_stamps
 from tk.io.captures.timing import resample as resampled
@@ -270,16 +268,10 @@ def open_capture(
     path, masks_asked = Path(path), masks
     if not path.is_dir():
         raise CaptureError(f"{path}: is not a folder; a capture is a folder with calibration.toml and videos/")
-    walk = find_walk(path)
-    calibration = (read_cameras(walk) if walk else read_calibration(path / "calibration.toml")).select(cameras)
+    calibration = read_calibration(path / "calibration.toml").select(cameras)
     rig = calibration.rig
     settings = read_settings(path / "capture.toml")
-    if walk and not (path / "capture.toml").exists():
-        settings = MOBO_SETTINGS
-
-    clips = _clips_of(calibration, path, "folder of pictures", "jpg") if walk else _open_clips(calibration, path)
-    if walk and walk.masks is not None and masks == "auto":
-        masks = str(walk.masks)
+    clips = _open_clips(calibration, path)
     mask_clips = _open_masks(calibration, path, masks)
     warnings: list[str] = [*calibration.notes, *notes_on(clips)]
     if settings.unknown:

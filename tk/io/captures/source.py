@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from tk.segmenters import Segmenter
 
 
+@runtime_checkable
 class Source(Protocol):
     """Yields the frame sets of all cameras of a setup. It needs no folder, and need not know its length."""
 

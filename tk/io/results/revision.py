@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,71 @@ from tk.io.results.reader import open_result
 from tk.io.results.schema import Column, columns_of, smoothed_columns
 
 
+@dataclass(frozen=True)
+class Revision:
+    """What replaces parts of a person's result; other parts stay as they are.
+
+    Attributes:
+        columns: new values of datasets with one row per frame, by dataset name, for all F frames:
+            ``{"pose": (F, D), "joints/position": (F, J, 3)}``. The result must have these datasets: a tracker that
+            fills them in a second pass declares them in its :class:`ResultMeta`, and the first pass writes NaN.
+            New columns delete `/smoothed`, unless ``smoothed`` is given.
+        smoothed: all of `/smoothed`, by the names of the unsmoothed datasets; ``bridged`` (F,) bool is required.
+        model: all of `/model`.
+    """
+
+    columns: Mapping[str, ArrayLike] = field(default_factory=dict)
+    smoothed: Mapping[str, ArrayLike] | None = None
+    model: Mapping[str, Value] | None = None
+
+
+def revise_people(
+    path: str | os.PathLike[str],
+    revisions: Mapping[int, Revision],
+    cameras: UsedCameras | None = None,
+    notes: Sequence[str] | None = None,
+) -> ResultMeta:
+    """Replace parts of a finished result in one step.
+
+    Args:
+        path: the result; no run may be writing it.
+        revisions: by number of the person.
+        cameras: all of `/cameras`.
+        notes: messages of the run, one line each.
+
+    Returns:
+        the result's metadata.
+
+    Raises:
+        ResultError: the file is no result, another run is writing it, or it cannot be written. It is unchanged.
+        ValueError: a dataset or a person is unknown, or a dataset has the wrong shape.
+    """
+    target = check_output(Path(path), ANY_HDF5, force=True, error=ResultError)
+    with open_result(target) as (_, people):
+        if unknown := revisions.keys() - set(range(len(people))):
+            raise ValueError(f"{path}: has no person {min(unknown)}")
+        meta, rows = people[0].meta, [person.count for person in people]
+    known = columns_of(meta)
+    checked = {}
+    for person, revision in revisions.items():
+        if revision.smoothed is not None and "bridged" not in revision.smoothed:
+            raise ValueError("/smoothed needs bridged, which is missing")
+        changed = _checked(known, revision.columns, rows[person])
+        checked[person] = changed, _checked(smoothed_columns(known), revision.smoothed or {}, rows[person])
+    with writing(target), Hdf5Writer(target, target) as disk:
+        layout = Layout(disk.file, meta)
+        for person, revision in revisions.items():
+            layout.replace(person, *checked[person])
+            if revision.model is not None:
+                layout.put_model(person, revision.model)
+        if cameras is not None:
+            layout.put_cameras(cameras)
+        if notes is not None:
+            put_attributes(disk.file, {"notes": notes})
+        layout.link_first_person()
+    return meta
+
+
 def revise_result(
     path: str | os.PathLike[str],
     columns: Mapping[str, ArrayLike] | None = None,
@@ -32,48 +98,8 @@ def revise_result(
     notes: Sequence[str] | None = None,
     person: int = 0,
 ) -> ResultMeta:
-    """Replace parts of a finished result in one step; other parts stay as they are.
-
-    Args:
-        path: the result; no run may be writing it.
-        columns: new values of datasets with one row per frame, by dataset name, for all F frames:
-            ``{"pose": (F, D), "joints/position": (F, J, 3)}``. The result must have these datasets: a tracker that
-            fills them in a second pass declares them in its :class:`ResultMeta`, and the first pass writes NaN.
-            New columns delete `/smoothed`, unless ``smoothed`` is given.
-        smoothed: all of `/smoothed`, by the names of the unsmoothed datasets; ``bridged`` (F,) bool is required.
-        model: all of `/model`.
-        cameras: all of `/cameras`.
-        notes: messages of the run, one line each.
-        person: the person to whom ``columns``, ``smoothed`` and ``model`` belong.
-
-    Returns:
-        the result's metadata.
-
-    Raises:
-        ResultError: the file is no result, another run is writing it, or it cannot be written. It is unchanged.
-        ValueError: a dataset or the person is unknown, or a dataset has the wrong shape.
-    """
-    target = check_output(Path(path), ANY_HDF5, force=True, error=ResultError)
-    with open_result(target) as (_, people):
-        if not 0 <= person < len(people):
-            raise ValueError(f"{path}: has no person {person}")
-        meta, rows = people[person].meta, people[person].count
-    known = columns_of(meta)
-    changed = _checked(known, columns or {}, rows)
-    if smoothed is not None and "bridged" not in smoothed:
-        raise ValueError("/smoothed needs bridged, which is missing")
-    filtered = _checked(smoothed_columns(known), smoothed or {}, rows)
-    with writing(target), Hdf5Writer(target, target) as disk:
-        layout = Layout(disk.file, meta)
-        layout.replace(person, changed, filtered)
-        if model is not None:
-            layout.put_model(person, model)
-        if cameras is not None:
-            layout.put_cameras(cameras)
-        if notes is not None:
-            put_attributes(disk.file, {"notes": notes})
-        layout.link_first_person()
-    return meta
+    """Replace parts of the result of one person, see :class:`Revision` and :func:`revise_people`."""
+    return revise_people(path, {person: Revision(columns or {}, smoothed, model)}, cameras, notes)
 
 
 def _checked(known: Mapping[str, Column], values: Mapping[str, ArrayLike], rows: int) -> dict[str, NDArray[Any]]:

@@ -7,14 +7,14 @@ standard deviations below the median). The height of a smaller person is given i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
 from tk.model.body.skeleton import JOINTS
+from tk.model.stateful import Stateful
 
 Float = NDArray[np.float64]
 
@@ -64,12 +64,22 @@ def check_stature(stature_m: float) -> None:
         )
 
 
-class Plausibility:
+@dataclass(frozen=True)
+class LastAccepted:
+    """The joints (J, 3), metres, of the last accepted frame, and its number; None after a loss."""
+
+    joints: Float | None
+    index: int
+
+
+class Plausibility(Stateful[LastAccepted]):
     """Checks the poses of consecutive frames, at ``fps`` frames per second."""
+
+    State = LastAccepted
 
     def __init__(self, fps: float) -> None:
         self._fps = fps
-        self._joints: Float | None = None  # of the last accepted frame
+        self._joints: Float | None = None
         self._index = -1
 
     def judge(self, index: int, joints: Float) -> str | None:
@@ -87,12 +97,3 @@ class Plausibility:
     def forget(self) -> None:
         """Forget the last pose, after a loss."""
         self._joints = None
-
-    def state(self) -> Mapping[str, Any]:
-        """Return what :meth:`restore` needs."""
-        return {} if self._joints is None else {"joints": self._joints, "index": self._index}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state."""
-        self._joints = np.asarray(state["joints"], np.float64) if "joints" in state else None
-        self._index = int(state.get("index", -1))

@@ -23,7 +23,7 @@ from tk.model.block_least_squares import Equations
 from tk.model.body.body_parameters import BodyFamily
 from tk.model.body.skeleton import SEGMENTS, Skeleton
 from tk.model.cameras.camera import Camera, Rig
-from tk.model.cues.landmarks import WEIGHT, LandmarkCue
+from tk.model.cues.landmarks import LandmarkCue
 from tk.model.masks.silhouettes import Pyramid, Views
 
 Float = NDArray[np.float64]
@@ -48,8 +48,6 @@ SEGMENT_M = 0.02
 _LIMIT = 1e3
 # Largest change in one iteration of a pose's entry (radians or metres) and of a body parameter: the linearisation holds
 # for about these.
-import os
-BODY = float(os.environ.get("BODYW","1"))
 LONGEST_STEP = (0.3, 0.1)
 
 #: parameters of a camera that may change, and how many numbers each has
@@ -204,7 +202,7 @@ class ContourBundle:
                 rows = np.hstack([by_pose[i:j], *by_camera, by_body[i:j]])
                 found.add(view.frame, columns, rows, self._information * view.edgels.weight, view.edgels.distance)
         # offsets of landmarks are the same in all frames, so that many frames say as much as one
-        seen = BODY / max(sum(frame.pyramid.landmarks is not None for frame in self.frames), 1)
+        seen = 1.0 / max(sum(frame.pyramid.landmarks is not None for frame in self.frames), 1)
         precision = np.full(D, POSE_DEVIATION**-2.0)
         precision[P:] = (self._segment_m or 1.0) ** -2.0
         for f, (frame, pose) in enumerate(zip(self.frames, state.poses, strict=True)):

@@ -10,7 +10,8 @@ never seen on it.
 from __future__ import annotations
 
 import functools
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from tk.kernels.line_search import COLOR_BINS, Regions
 from tk.model.body.cone_body import COLOR_GROUPS, ConeBody
+from tk.model.stateful import Stateful
 
 Float = NDArray[np.float64]
 
@@ -45,7 +47,16 @@ class RenderedBody(NamedTuple):
     log_likelihood: NDArray[np.float32] | None = None
 
 
-class PartColors:
+@dataclass(frozen=True)
+class LearnedColors:
+    """Counts of the colours of each group (G, COLOR_BINS), and beside the body (COLOR_BINS,); None before any are
+    learned."""
+
+    counts: Float | None
+    outside: Float | None
+
+
+class PartColors(Stateful[LearnedColors]):
     """The colour models of one person.
 
     Args:
@@ -58,10 +69,15 @@ class PartColors:
         mismatch: (COLOR_BINS, G) in [0, 1], how much less likely a colour is in a group than in its likeliest group.
     """
 
+    State = LearnedColors
+
     def __init__(self, body: ConeBody) -> None:
         self._group = body.color_group
-        self._counts: Float = np.zeros((len(COLOR_GROUPS), COLOR_BINS))
-        self._outside: Float = np.zeros(COLOR_BINS)
+        self._counts: Float | None = None
+        self._outside: Float | None = None
+        self._forget()
+
+    def _forget(self) -> None:
         self.foreign = np.zeros(COLOR_BINS, np.bool_)
         self.log_likelihood: NDArray[np.float32] | None = None
         self.mismatch = np.zeros((COLOR_BINS, len(COLOR_GROUPS)), np.float32)
@@ -69,20 +85,23 @@ class PartColors:
     @property
     def known(self) -> bool:
         """Return whether any colours have been learned."""
-        return self.log_likelihood is not None
+        return self._counts is not None
 
     def learn(self, bins: NDArray[np.int32], label: NDArray[np.uint8]) -> None:
         """Learn the colours (N,) of the mask's pixels; they show the parts ``label - 1`` (N,), or none: 0."""
         shown = label > 0
+        counts = np.zeros((len(COLOR_GROUPS), COLOR_BINS)) if self._counts is None else self._counts
+        before = np.zeros(COLOR_BINS) if self._outside is None else self._outside
         flat = self._group[label[shown].astype(np.int64) - 1] * COLOR_BINS + bins[shown]
-        seen = np.bincount(flat, minlength=self._counts.size).reshape(self._counts.shape)
+        seen = np.bincount(flat, minlength=counts.size).reshape(counts.shape)
         outside = np.bincount(bins[~shown], minlength=COLOR_BINS)
         rate = _RATE if self.known else 1.0
-        self._counts = (1 - rate) * self._counts + rate * seen
-        self._outside = (1 - rate) * self._outside + rate * outside
+        self._counts = (1 - rate) * counts + rate * seen
+        self._outside = (1 - rate) * before + rate * outside
         self._update()
 
     def _update(self) -> None:
+        assert self._counts is not None and self._outside is not None
         smooth = _smooth(np.concatenate([self._counts, self._outside[None]]))
         outside, rows = smooth[-1], np.concatenate([smooth[:-1], smooth[:-1].sum(axis=0, keepdims=True)])
         total = np.sum(rows, axis=1, keepdims=True)
@@ -102,21 +121,16 @@ class PartColors:
     def likeness(self, bins: NDArray[np.int32]) -> float:
         """Return the mean log-likelihood of colours (N,), relative to that of the learned colours: about 0 if they are
         the person's, less otherwise. 0 before any colours are learned."""
-        if self.log_likelihood is None or not len(bins):
+        if self.log_likelihood is None or self._counts is None or not len(bins):
             return 0.0
         likeliest, seen = self.log_likelihood.max(axis=0), self._counts.sum(axis=0)
         return float(likeliest[bins].mean() - seen @ likeliest / seen.sum())
 
-    def state(self) -> dict[str, Any]:
-        """Return what :meth:`restore` needs."""
-        return {"colors": self._counts, "colors_outside": self._outside} if self.known else {}
-
-    def restore(self, state: Any) -> None:
-        """Continue from a state."""
-        if "colors" in state:
-            self._counts = np.asarray(state["colors"], np.float64)
-            self._outside = np.asarray(state["colors_outside"], np.float64)
+    def _restored(self) -> None:
+        if self.known:
             self._update()
+        else:
+            self._forget()
 
 
 def color_bins(images: NDArray[np.uint8]) -> NDArray[np.int32]:

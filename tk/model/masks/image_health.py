@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.mask_values import PERSON
-from tk.model.masks.image_shift import ImageShift
+from tk.model.masks.image_shift import ImageShift, ShiftState
+from tk.model.stateful import Stateful
 
 # Rows of an image that are compared, approximately.
 _ROWS = 64
@@ -46,7 +47,22 @@ Sampled = tuple[NDArray[np.int16], NDArray[np.bool_]]
 BLANK, FROZEN, MOVED = "shows nothing", "stands still", "has been moved since the first frame"
 
 
-class ImageHealth:
+@dataclass(frozen=True)
+class HealthState:
+    """What is known of C cameras.
+
+    Attributes:
+        references: (C, h, w) grey, of the reference frame of each camera; None before the first frame.
+        masks: (C, C, h, w) at the reference frame of camera c, those of all.
+        shift: of the images.
+    """
+
+    references: NDArray[np.uint8] | None
+    masks: NDArray[np.bool_] | None
+    shift: ShiftState
+
+
+class ImageHealth(Stateful[HealthState]):
     """Checks the images of consecutive frames.
 
     An unchanged image is normal while nobody moves. So each camera keeps a reference: its last image that differed from
@@ -57,9 +73,11 @@ class ImageHealth:
     :class:`~tk.model.masks.image_shift.ImageShift`.
     """
 
+    State = HealthState
+
     def __init__(self) -> None:
-        self._references: NDArray[np.uint8] | None = None  # (C, h, w) grey, of the reference frame of each camera
-        self._masks: NDArray[np.bool_] | None = None  # (C, C, h, w): at camera c's reference frame those of all
+        self._references: NDArray[np.uint8] | None = None
+        self._masks: NDArray[np.bool_] | None = None
         self._shift = ImageShift()
 
     def look(
@@ -97,24 +115,6 @@ class ImageHealth:
                 if 2 * len(others) >= C - 1 and np.mean(others) > 0.5:
                     found[c] = FROZEN
         return found
-
-    def state(self) -> Mapping[str, Any]:
-        """Return what :meth:`restore` needs."""
-        if self._references is None or self._masks is None:
-            return {}
-        shift = {f"shift_{name}": value for name, value in self._shift.state().items()}
-        return {"references": self._references, "masks": np.packbits(self._masks), **shift}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state."""
-        if "references" not in state:
-            self._references = self._masks = None
-            return
-        self._shift.restore({name[6:]: value for name, value in state.items() if name.startswith("shift_")})
-        self._references = np.array(state["references"], np.uint8)
-        C, h, w = self._references.shape
-        bits = np.unpackbits(np.asarray(state["masks"], np.uint8), count=C * C * h * w)
-        self._masks = bits.reshape(C, C, h, w).astype(bool)
 
 
 def sampled(images: NDArray[np.uint8], masks: NDArray[np.uint8]) -> Sampled:

@@ -10,13 +10,15 @@ only if the images differ clearly more without it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import permutations
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from tk.model.stateful import Stateful
 
 Float = NDArray[np.float64]
 Gray = NDArray[np.float32]
@@ -46,13 +48,34 @@ _LEAST_RATIO = 1.25
 _SAME_PLACE = 0.1
 
 
-class ImageShift:
+@dataclass(frozen=True)
+class ShiftState:
+    """What is known of C cameras.
+
+    Attributes:
+        first: (C, h, w) the images that later ones are registered with; None before the first frame.
+        still: (C, h, w) where nobody is in them.
+        begun: (C,) whether a camera's mask could be trusted in a frame.
+        shift: (C, 2) pixels.
+        calls: number of frames.
+    """
+
+    first: NDArray[np.uint8] | None
+    still: NDArray[np.bool_]
+    begun: NDArray[np.bool_]
+    shift: Float
+    calls: int
+
+
+class ImageShift(Stateful[ShiftState]):
     """Registers the images of consecutive frames with those of the first one, one camera in every second frame."""
 
+    State = ShiftState
+
     def __init__(self) -> None:
-        self._first: NDArray[np.uint8] | None = None  # (C, h, w)
-        self._still = np.zeros((0, 0, 0), np.bool_)  # (C, h, w), where nobody is in the first frame
-        self._begun = np.zeros(0, np.bool_)  # (C,) whether a camera's mask could be trusted in a frame
+        self._first: NDArray[np.uint8] | None = None
+        self._still = np.zeros((0, 0, 0), np.bool_)
+        self._begun = np.zeros(0, np.bool_)
         self._shift = np.zeros((0, 2))
         self._calls = 0
 
@@ -93,24 +116,6 @@ class ImageShift:
         if correlation < _LEAST_CORRELATION:  # a jump is out of the reach of small steps
             shift, correlation = _register(first, now, still, _jump(first * self._still[c], now * still_now))
         self._shift[c] = shift if correlation >= _LEAST_CORRELATION else np.nan
-
-    def state(self) -> Mapping[str, Any]:
-        """Return what :meth:`restore` needs."""
-        if self._first is None:
-            return {}
-        state = {"first": self._first, "still": self._still, "begun": self._begun, "shift": self._shift}
-        return {**state, "calls": self._calls}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state."""
-        if "first" not in state:
-            self._first = None
-            return
-        self._first = np.array(state["first"], np.uint8)
-        self._still = np.array(state["still"], np.bool_)
-        self._begun = np.array(state["begun"], np.bool_)
-        self._shift = np.array(state["shift"], np.float64)
-        self._calls = int(state["calls"])
 
 
 def shift_between(first: NDArray[np.uint8], image: NDArray[np.uint8], mask: NDArray[np.uint8]) -> float:

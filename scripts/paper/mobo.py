@@ -1,4 +1,8 @@
-"""Reads a walk of the CMU Motion of Body (MoBo) database as a capture.
+"""Makes a capture of a walk of the CMU Motion of Body (MoBo) database, the recordings of the paper on silhouettes.
+
+    python -m scripts.paper.mobo ROOT/moboJpg/04002/slowWalk CAPTURE
+
+The capture links to the pictures and masks.
 
 R. Gross and J. Shi, *The CMU Motion of Body (MoBo) Database*, CMU-RI-TR-01-18, 2001: 25 subjects on a treadmill, four
 walks, six cameras (vr03_7, vr05_7, vr07_7, vr13_7, vr16_7, vr17_7), 30 frames/s, masks from a background subtraction.
@@ -16,22 +20,22 @@ files, the order of the numbers and the vertical axis (z) are from memory, and t
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
+import tomli_w
 from numpy.typing import NDArray
 
-from tk.errors import CalibrationError
-from tk.io.captures.calibration import Calibration
-from tk.io.captures.capture_toml import CaptureSettings
+from tk.errors import CalibrationError, CaptureError, TkError
+from tk.io.captures.calibration import camera_table
 from tk.io.paths import c_name
 from tk.model.cameras.camera import Camera, Rig
-from tk.model.cameras.mounting import infer_up
 
 #: the walks begin in any pose
-SETTINGS = CaptureSettings(fps=30.0, up="z", init_pose="any")
+_SETTINGS = 'fps = 30.0\nup = "z"\n\n[init]\npose = "any"\n'
 
 _PICTURES, _MASKS = "moboJpg", "moboBgSub"
 _NUMBERS = (
@@ -56,9 +60,9 @@ class MoboWalk:
 
 
 def find_walk(path: Path) -> MoboWalk | None:
-    """Return the walk at ``path``; None if the folder has no ``vr…`` folders, or has a ``calibration.toml``."""
+    """Return the walk at ``path``; None if the folder has no ``vr…`` folders."""
     cameras = sorted(folder.name for folder in path.glob("vr[0-9][0-9]*") if folder.is_dir())
-    if not cameras or (path / "calibration.toml").exists():
+    if not cameras:
         return None
     files: dict[str, Path] = {}
     full = path.resolve()
@@ -75,7 +79,7 @@ def find_walk(path: Path) -> MoboWalk | None:
     return MoboWalk(path, files, masks)
 
 
-def read_cameras(walk: MoboWalk) -> Calibration:
+def read_cameras(walk: MoboWalk) -> Rig:
     """Return the cameras of a walk that have a camera file; their sizes are those of the images.
 
     Raises:
@@ -84,10 +88,32 @@ def read_cameras(walk: MoboWalk) -> Calibration:
     if len(walk.files) < 2:
         raise CalibrationError(
             f"{walk.path}: looks like a MoBo walk, but {len(walk.files)} of its vr… folders have a camera file; put "
-            "vr03_7.cal and so on beside them, or write a calibration.toml"
+            "vr03_7.cal and so on beside them"
         )
-    cameras = tuple(_read_camera(name, file, _picture_size(walk.path / name)) for name, file in walk.files.items())
-    return Calibration(walk.path, Rig(cameras), tuple(walk.files), mounting=infer_up(Rig(cameras)))
+    return Rig(tuple(_read_camera(name, file, _picture_size(walk.path / name)) for name, file in walk.files.items()))
+
+
+def write_capture(path: Path, output: Path) -> None:
+    """Write the capture of the walk at a path: calibration, settings, and links to pictures and masks.
+
+    Raises:
+        CaptureError: there is no walk, or the capture exists.
+        CalibrationError: see :func:`read_cameras`.
+    """
+    walk = find_walk(path)
+    if walk is None:
+        raise CaptureError(f"{path}: is no MoBo walk: it has no folders vr03_7 and so on")
+    if output.exists():
+        raise CaptureError(f"{output}: exists; give another folder")
+    rig = read_cameras(walk)
+    trees = {"images": walk.path, **({"masks": walk.masks} if walk.masks else {})}
+    for tree, folder in trees.items():
+        (output / tree).mkdir(parents=True)
+        for name in rig.names:
+            (output / tree / name).symlink_to((folder / name).resolve(), target_is_directory=True)
+    tables = {camera.name: camera_table(camera) for camera in rig}
+    (output / "calibration.toml").write_text(tomli_w.dumps(tables), encoding="utf-8")
+    (output / "capture.toml").write_text(_SETTINGS, encoding="utf-8")
 
 
 def _read_camera(name: str, file: Path, size: tuple[int, int]) -> Camera:
@@ -134,3 +160,19 @@ def _picture_size(folder: Path) -> tuple[int, int]:
         if picture is not None:
             return picture.shape[1], picture.shape[0]
     raise CalibrationError(f"{folder}: holds no pictures")
+
+
+def main() -> None:
+    """Make the capture that the arguments name."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("walk", type=Path, help="folder with a folder of images for each camera")
+    parser.add_argument("capture", type=Path, help="folder to make")
+    given = parser.parse_args()
+    try:
+        write_capture(given.walk, given.capture)
+    except TkError as error:
+        parser.error(str(error))
+
+
+if __name__ == "__main__":
+    main()

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from tests.conftest import Tk
+from scripts.paper.mobo import camera_from_tsai, rotation_zyx, write_capture
+from tests.conftest import refused
+from tk.errors import CalibrationError, CaptureError
 from tk.io.captures.capture import open_capture
-from tk.io.captures.mobo import camera_from_tsai, find_walk, rotation_zyx
 from tk.model.cameras.camera import Camera
 
 NAMES = ("vr03_7", "vr05_7", "vr07_7", "vr13_7")
@@ -48,8 +50,9 @@ def walk(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return pictures
 
 
-def test_a_walk_opens_as_a_capture(tiny: Path, walk: Path) -> None:
-    source, found = open_capture(tiny), open_capture(walk)
+def test_a_walk_becomes_a_capture(tiny: Path, walk: Path, tmp_path: Path) -> None:
+    write_capture(walk, tmp_path / "capture")
+    source, found = open_capture(tiny), open_capture(tmp_path / "capture")
     assert found.rig.names == NAMES and found.frame_count == FRAMES
     assert (found.fps, found.init_pose, found.has_masks) == (30.0, "any", True)
     p = np.random.default_rng(0).uniform([-0.5, -0.5, 0.2], [0.5, 0.5, 1.8], (50, 3))
@@ -58,20 +61,6 @@ def test_a_walk_opens_as_a_capture(tiny: Path, walk: Path) -> None:
         np.testing.assert_allclose(b.project(p)[0], flat.project(p)[0], atol=1e-6)
     with source.frames(0, 1) as first, found.frames(0, 1) as second:
         np.testing.assert_array_equal(next(first).masks, next(second).masks)
-
-
-def test_cameras_and_masks_can_be_chosen(walk: Path) -> None:
-    assert open_capture(walk, ["vr03_7", "vr13_7"]).rig.names == ("vr03_7", "vr13_7")
-    assert not open_capture(walk, masks="none").has_masks
-
-
-def test_a_walk_is_tracked(tk: Tk, walk: Path, tmp_path: Path) -> None:
-    settings = tmp_path / "s.toml"
-    lines = ["ahead = 0", "[silhouette]", "init_frames = 2", "adapt = false"]
-    settings.write_text("\n".join(lines), encoding="utf-8")
-    output = tmp_path / "r.h5"
-    ran = tk("track", walk, "-o", output, "--method", "silhouette", "--config", settings)
-    assert ran.code == 0 and f"{FRAMES} frames in" in ran.err
 
 
 def test_tsais_lens_distortion_is_inverted() -> None:
@@ -86,17 +75,17 @@ def test_tsais_lens_distortion_is_inverted() -> None:
         np.testing.assert_allclose(d * (1 + kappa * d @ d), [f * x / z, f * y / z], atol=2e-4)
 
 
-def test_bad_camera_files_are_reported_in_one_line(tk: Tk, walk: Path, tmp_path: Path) -> None:
-    import shutil
-
+def test_bad_camera_files_are_refused_in_one_line(walk: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(walk.parents[2], tmp_path / "mobo"))
-    sequence = copy / "moboJpg" / "04002" / "slowWalk"
+    sequence, capture = copy / "moboJpg" / "04002" / "slowWalk", tmp_path / "capture"
     file = copy / "calibration" / "vr05_7.cal"
-    command = ("track", sequence, "-o", tmp_path / "r.h5", "--method", "silhouette")
-    file.write_text("1 2 3", encoding="utf-8")
-    tk(*command).complaint("vr05_7.cal", "holds 3 numbers")
-    file.write_text("one", encoding="utf-8")
-    tk(*command).complaint("vr05_7.cal", "cannot be read as numbers")
+    for text, reason in (("1 2 3", "holds 3 numbers"), ("one", "cannot be read as numbers")):
+        file.write_text(text, encoding="utf-8")
+        with refused(CalibrationError, "vr05_7.cal", reason):
+            write_capture(sequence, capture)
     shutil.rmtree(copy / "calibration")
-    tk(*command).complaint("slowWalk", "camera file")
-    assert find_walk(tmp_path) is None
+    with refused(CalibrationError, "slowWalk", "camera file"):
+        write_capture(sequence, capture)
+    with refused(CaptureError, "no MoBo walk"):
+        write_capture(tmp_path, capture)
+    assert not capture.exists()
