@@ -28,6 +28,7 @@ META = ResultMeta(
     config_toml='method = "volumetric"\n[smd]\nmu = 0.1\n',
     sigma=True,
     residual_cameras=("cam1", "cam2", "cam3"),
+    landmark_names=("nose", "toe_r"),
     mask_sources=("scene", "segmenter"),
     segment_names=("torso", "head"),
     feet=True,
@@ -40,7 +41,7 @@ META = ResultMeta(
 
 
 def make_frame(index: int) -> dict[str, Any]:
-    """Return the values of frame ``index`` by path; some frames have no voxels and some no sigma."""
+    """Return the values of frame ``index`` by path; some frames have no voxels, no sigma or no landmarks."""
     frame: dict[str, Any] = {
         "frames": index + 3,
         "time": index / 15,
@@ -60,6 +61,8 @@ def make_frame(index: int) -> dict[str, Any]:
     }
     if index % 4 != 3:
         frame["joints/sigma"] = np.full(15, 0.01 * index)
+    if index % 4 != 1:
+        frame["landmarks"] = np.arange(18.0).reshape(3, 2, 3) + index
     if index % 5:
         count = 200 + index % 37
         frame["hull/positions"] = np.full((count, 3), index / 8)

@@ -45,6 +45,7 @@ def test_written_values_are_read_back(path: Path, tmp_path: Path) -> None:
         "frames": "frames", "time": "time", "pose": "pose", "joints/position": "joints", "status": "status",
         "objective": "objective", "iterations": "iterations", "joints/sigma": "sigma", "residual": "residual",
         "mask_source": "mask_source", "segments/rotation": "segments_rotation", "feet/position": "feet",
+        "landmarks": "landmarks",
     }  # fmt: skip
     for name, field in fields.items():
         np.testing.assert_array_equal(getattr(result, field)[6], make_frame(6)[name], err_msg=name)
@@ -52,6 +53,7 @@ def test_written_values_are_read_back(path: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(result.timing["total"][6], make_frame(6)["timing/total"])
     assert list(result.angles) == ["knee_l", "hip_l"] and result.timing["optimise"][6] == 0
     assert result.sigma is not None and np.isnan(result.sigma[7]).all()
+    assert result.landmarks is not None and np.isnan(result.landmarks[5]).all()
     assert result.silhouette_error is not None and result.silhouette_error[4].tolist() == [0.1, 0.2, 4]
     assert result.hull is not None and len(result.hull[5].positions) == 0
     np.testing.assert_array_equal(result.hull[7].positions, make_frame(7)["hull/positions"])
@@ -77,6 +79,7 @@ def test_layout_is_the_contract(path: Path) -> None:
         "objective": ((2,), "float64", {}),
         "residual": ((2, 3, 2), "float64", {"cameras": META.residual_cameras, "areas": ("missing", "surplus")}),
         "mask_source": ((2, 3), "uint8", {"cameras": META.residual_cameras}),
+        "landmarks": ((2, 3, 2, 3), "float32", {"names": META.landmark_names, "cameras": META.residual_cameras}),
         "iterations": ((2, 2), "int32", {"stages": META.stages}),
         "timing/optimise": ((2,), "float64", {}),
     }  # fmt: skip
@@ -185,11 +188,11 @@ def test_wrong_frame_is_refused_and_earlier_frames_are_kept(path: Path, change: 
 def test_undeclared_datasets_are_absent(path: Path) -> None:
     """Also those of pose and joints have no columns in a result that has only a hull."""
     plain = replace(
-        META, sigma=False, residual_cameras=(), mask_sources=(), segment_names=(), feet=False, angles=(),
-        objective_kind="", pose_names=(), pose_units=(), joint_names=(), stages=(),
+        META, sigma=False, residual_cameras=(), mask_sources=(), landmark_names=(), segment_names=(), feet=False,
+        angles=(), objective_kind="", pose_names=(), pose_units=(), joint_names=(), stages=(),
     )  # fmt: skip
     empty = {"pose": (), "joints/position": np.zeros((0, 3)), "iterations": ()}
-    optional = ("joints/sigma", "residual", "mask_source", "segments", "feet", "angles")
+    optional = ("joints/sigma", "residual", "mask_source", "landmarks", "segments", "feet", "angles")
     with ResultWriter.create(path, plain) as writer:
         for index in range(3):
             frame = make_frame(index) | empty
