@@ -112,6 +112,10 @@ class RegionSettings:
         _check("region", self, hypotheses=(1, 20), false_alarm=(1e-12, 0.5))
 
 
+#: values of :attr:`Settings.landmarks`
+LANDMARK_MODES = ("auto", "always", "never")
+
+
 @dataclass(frozen=True)
 class Settings:
     """All settings of a run.
@@ -127,6 +131,9 @@ class Settings:
         refine: whether inconsistent cameras are refined before the second pass.
         resample: whether each frame's images are chosen by their time stamps, for cameras of different or variable
             rates. A frame for which a camera has no image within half an interval is blank in this camera.
+        landmarks: which frames a network's landmarks are used in, see :mod:`tk.model.cues.landmarks`. "auto": those that
+            the network sees for its masks; "always": all, also with an empty scene or given masks (about a second of
+            processor time a frame set); "never": none.
         person_pixels: least height in pixels at which a person is tracked. The images of a camera that shows the person
             at n times this height are read at 1/n of their size; 0: all at full size. Measured: at 250 to 350 pixels
             limbs are as accurate as at 620; at 205 they are 0.1 cm worse, at 150 0.2 to 0.4 cm, at 100 0.5 to 3 cm.
@@ -138,6 +145,7 @@ class Settings:
     effort: float = 1.0
     refine: bool = True
     resample: bool = False
+    landmarks: str = "auto"
     person_pixels: int = 240
     foreground: ForegroundSettings = field(default_factory=ForegroundSettings)
     volumetric: VolumetricSettings = field(default_factory=VolumetricSettings)
@@ -151,6 +159,8 @@ class Settings:
             raise ConfigError(f"seed = {self.seed}: choose from 0 to {2**63 - 1}")
         if not 0 <= self.ahead <= 64:
             raise ConfigError(f"ahead = {self.ahead}: choose from 0 to 64 frames")
+        if self.landmarks not in LANDMARK_MODES:
+            raise ConfigError(f"landmarks = {self.landmarks!r}: choose from {', '.join(LANDMARK_MODES)}")
         if not 0 <= self.person_pixels <= MOST_COUNT:
             raise ConfigError(f"person_pixels = {self.person_pixels}: choose from 0 (full size) to {MOST_COUNT}")
         if not 0.05 <= self.effort <= 20:

@@ -192,6 +192,11 @@ _TRACKING_OPTIONS = (
     frames_option,
     click.option("--seed", type=int, help="Seed of the random candidate poses.  [default: 0]"),
     masks_option,
+    click.option(
+        "--landmarks", type=click.Choice(["auto", "always", "never"]),
+        help="Use the joints that a network sees: in the frames that it sees for its masks, in all, or in none.  "
+        "[default: auto]",
+    ),
     click.option("--body", type=PATH, metavar="FILE", help="Use the body of a result (.h5) or of a TOML file."),
     click.option(
         "--people", default="auto", show_default=True, metavar="auto|all|N,M", callback=_people,
@@ -219,6 +224,7 @@ def recording_options(
     voxels: int | None,
     seed: int | None,
     resample: bool | None,
+    landmarks: str | None,
     **others: Any,
 ) -> RecordingOptions:
     """Return the options of a run as given on the command line; those that are not settings have the names of
@@ -229,7 +235,7 @@ def recording_options(
     """
     from tk.run.task import RecordingOptions
 
-    settings = load_settings(config_file, preset, voxels=voxels, seed=seed, resample=resample)
+    settings = load_settings(config_file, preset, voxels=voxels, seed=seed, resample=resample, landmarks=landmarks)
     return RecordingOptions(settings, **others)
 
 

@@ -22,7 +22,7 @@ from tk.model.body.skeleton import SEGMENTS, build_skeleton
 from tk.model.cues.landmarks import LANDMARKS
 from tk.model.setup import Setup, Subject
 from tk.run.prefetch import TIMING_STAGES, Observations, open_observations
-from tk.run.segmentation import mask_source, sources_of_masks
+from tk.run.segmentation import mask_source, sees_landmarks, sources_of_masks
 from tk.run.task import RecordingOptions, Task, describe
 from tk.trackers.bodies import read_body
 from tk.trackers.protocol import Tracker
@@ -155,7 +155,7 @@ class Plan:
             sigma=tracker.reports_sigma,
             residual_cameras=setup.rig.names if tracker.reports_sigma else (),
             mask_sources=sources_of_masks(task.source) if tracker.reports_sigma else (),
-            landmark_names=LANDMARKS if tracker.reports_sigma and sources_of_masks(task.source) else (),
+            landmark_names=LANDMARKS if tracker.reports_sigma and sees_landmarks(task) else (),
             segment_names=SEGMENTS if tracker.has_segments else (),
             feet=tracker.has_segments,
             angles=JointAngles.of_body(tracker.pose_names) if tracker.has_segments else (),

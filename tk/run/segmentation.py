@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import CaptureError
+from tk.errors import CaptureError, ConfigError
 from tk.io.captures.frames import FrameSet
 from tk.io.captures.source import Source
 from tk.model.masks.background import median_plate
@@ -91,10 +91,43 @@ def make_labeller(task: Task, note: Callable[[str], None]) -> Labeller:
         CaptureError: there is nothing to make masks from, or the median is not the empty scene.
         ConfigError: the segmenter cannot be loaded.
     """
-    if mask_source(task.source) in (_GIVEN, _SCENE):
+    asks = task.settings.landmarks == "always"
+    if mask_source(task.source) in (_GIVEN, _SCENE) and not asks:
         return _labeller(task, note)  # no matrix products in it; SciPy takes long to import
     with one_thread():
-        return one_thread()(_labeller(task, note))
+        labeller = _labeller(task, note)
+        if task.settings.landmarks == "never":
+            return one_thread()(lambda frame: labeller(frame)._replace(landmarks=None))
+        return one_thread()(_with_landmarks(task, labeller) if asks else labeller)
+
+
+def sees_landmarks(task: Task) -> bool:
+    """Return whether a network's landmarks are used in some frames."""
+    asked = task.settings.landmarks
+    return asked == "always" or (asked == "auto" and bool(sources_of_masks(task.source)))
+
+
+def _with_landmarks(task: Task, labeller: Labeller) -> Labeller:
+    """Return a labeller that asks the segmenter for the landmarks of every frame.
+
+    Raises:
+        ConfigError: no segmenter is installed, or it cannot be loaded.
+    """
+    from tk.segmenters.people_masks import PeopleMasks  # SciPy, which takes a second to import
+
+    installed = names()
+    if task.source.segmenter is None and not installed:
+        raise ConfigError(f"landmarks = always: {NO_SEGMENTER}")
+    name = installed[0] if task.source.segmenter is None else type(task.source.segmenter).__name__
+    people = PeopleMasks(task.source.segmenter or load(name), name, task.setup.rig, task.setup.volume)
+
+    def label(frame: FrameSet) -> Labels:
+        labels = labeller(frame)
+        if labels.landmarks is None and frame.images.size:
+            labels = labels._replace(landmarks=people.label(frame.images).landmarks)
+        return labels
+
+    return label
 
 
 def prepare_kernels() -> None:
