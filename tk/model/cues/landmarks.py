@@ -213,8 +213,8 @@ def contradiction(rig: Rig, body: ConeBody, pose: Float, seen: Float) -> Float:
     """Return (J,) variance of the joints' positions along an axis, metres², from the distances between a pose (D,) and
     the triangulated landmarks (V, L, 3), beyond the landmarks' own errors.
 
-    Pose or landmark may be right, so half of the squared distance counts. Neck and pelvis have the mean of shoulders and hips,
-    the crown that of the face.
+    Pose or landmark may be right, so half of the squared distance counts. Neck and pelvis have the mean of shoulders
+    and hips, the crown that of the face.
     """
     points, _ = triangulate_joints(rig, seen)
     size = body.dimensions.stature / AVERAGE_STATURE_M
