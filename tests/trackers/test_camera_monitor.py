@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from tests.conftest import FITTED, FRAMES
+from tests.model.landmarks import landmarks_of
+from tests.trackers.walker import BODY, walk
 from tk.errors import CaptureError
 from tk.io import settings_file
 from tk.io.captures.capture import Capture, open_capture
@@ -21,7 +23,7 @@ from tk.model.body.joint_sigma import VIEW_M
 from tk.model.cameras.common_view import LEAST_INFORMATION, depth_information
 from tk.model.masks.mask_agreement import Agreement
 from tk.model.setup import Subject
-from tk.trackers.camera_monitor import CameraMonitor, MonitorState
+from tk.trackers.camera_monitor import CameraMonitor, MonitorState, opening_agreement
 from tk.trackers.protocol import Estimate, Observation
 from tk.trackers.region import RegionTracker
 
@@ -129,6 +131,22 @@ def test_turned_camera_is_excluded_and_included_again(scene: Scene) -> None:
     assert "camera cam2 disagrees with the others" in line and "frames 5 to 10" in line
     # the residual of an excluded camera is unknown
     assert estimates[6].residual is not None and np.isnan(estimates[6].residual[1]).all()
+
+
+@pytest.mark.parametrize(
+    ("seen", "wrong"), [("none", True), ("right", False), ("turned", True), ("in two images", True)]
+)
+def test_landmarks_confirm_a_camera_whose_masks_contradict_the_others(scene: Scene, seen: str, wrong: bool) -> None:
+    """The masks of a camera are displaced; its landmarks are right, displaced with the masks, or unknown."""
+    frames = []
+    for frame in map(moved(1, range(FRAMES)), scene.frames[:3]):
+        landmarks = landmarks_of(scene.setup.rig, BODY, walk(1)[0], 0.02, seed=frame.index)[None]
+        if seen == "turned":
+            landmarks[:, 1, :, 0] += 40.0
+        if seen == "in two images":
+            landmarks[:, 2:] = np.nan
+        frames.append(replace(frame, landmarks=None if seen == "none" else landmarks))
+    assert (1 in opening_agreement(scene.setup, frames).wrong) == wrong
 
 
 def test_two_cameras_that_face_each_other_contradict_no_third(scene: Scene) -> None:

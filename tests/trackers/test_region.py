@@ -558,6 +558,32 @@ def test_estimate_has_the_landmarks_of_its_person() -> None:
     np.testing.assert_array_equal(found.landmarks, people[1])
 
 
+def test_second_pass_ignores_landmarks_of_excluded_cameras() -> None:
+    tracker, residual = tracker_at(POSES[0]), np.zeros((3, 3, 2))
+    residual[:, 2] = np.nan
+    wrong = np.stack([exchanged(pose, pairs(tracker.limbs))[1] for pose in POSES[:3]])
+    spoilt = np.stack([seen_at(pose)[0] for pose in POSES[:3]])
+    spoilt[:, 2, :, :2] += 20.0
+    plain = spoilt.copy()
+    plain[:, 2] = np.nan
+    lost = np.zeros(3, bool)
+    found, same = (
+        tracker.second_pass(MASKS[:3], wrong, lost, residual, None, landmarks, keep_body=True)[0]
+        for landmarks in (spoilt, plain)
+    )
+    np.testing.assert_array_equal(found, same)
+
+
+def test_second_pass_corrects_legs_by_landmarks_of_all_cameras() -> None:
+    """Legs that are exchanged in all frames: no other frame shows them right."""
+    tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=0.1))
+    wrong = np.stack([exchanged(pose, pairs(tracker.limbs))[1] for pose in POSES])
+    landmarks = np.stack([seen_at(pose)[0] for pose in POSES])
+    found, _, _ = tracker.second_pass(MASKS, wrong, np.zeros(6, bool), np.zeros((6, 3, 2)), None, landmarks, True)
+    off = np.linalg.norm(SKELETON.joints(found) - SKELETON.joints(POSES), axis=2).max(axis=1)
+    assert (off < 3 * CLOSE_M).all()
+
+
 def test_no_heading_is_doubted_that_landmarks_have_shown() -> None:
     tracker = tracker_at(POSES[0])
     tracker.step(replace(observe(MASKS[0], 0), landmarks=seen_at(POSES[0])))

@@ -204,7 +204,7 @@ class _Finisher:
             draft.lost,
             draft.current("residual"),
             subject.height_m,
-            self._landmarks(draft),
+            self._landmarks(draft, self._late),
             # in the initialisation pose every limb is visible; other first poses may hide limbs, and so may others
             keep_body=subject.body is not None
             or (self.alone and subject.init is None and subject.in_init_pose and not turned),
@@ -242,7 +242,9 @@ class _Finisher:
         residual = []
         for hypothesis, one in zip(hypotheses, drafts, strict=True):
             first = one.current("pose"), one.lost, one.current("residual")
-            again = hypothesis.second_pass(seen, *first, height_m, self._landmarks(draft), True, self.within)
+            again = hypothesis.second_pass(
+                seen, *first, height_m, self._landmarks(draft, self._late), True, self.within
+            )
             residual.append(again[1].sum(axis=-1))
         both = ~(drafts[0].lost | drafts[1].lost)
         if not np.nanmean(residual[1][both]) < np.nanmean(residual[0][both]):
@@ -314,12 +316,13 @@ class _Finisher:
         found = self.cameras.time_offset_s - self.task.source.time_offset_s
         return np.round(found * self.task.setup.fps).astype(np.int64)
 
-    def _landmarks(self, draft: _Draft) -> NDArray[np.float64] | None:
-        """Return the landmarks (F, C, L, 3) of a draft, synchronised, in pixels of the cameras in use; None without."""
+    def _landmarks(self, draft: _Draft, late: NDArray[np.int64]) -> NDArray[np.float64] | None:
+        """Return the landmarks (F, C, L, 3) of a draft, in pixels of the cameras in use, synchronised with videos that
+        are late by whole frames (C,); None if it has none."""
         found = draft.current("landmarks")
         if found is None:
             return None
-        return retimed_landmarks(self.task.setup.rig.reduced_pixels(found), draft.result.frames, self._late)
+        return retimed_landmarks(self.task.setup.rig.reduced_pixels(found), draft.result.frames, late)
 
     def _track_again(
         self, member: Member, draft: _Draft, before: Used, now: Used, late: NDArray[np.int64]
@@ -338,7 +341,7 @@ class _Finisher:
         if source is None or source.frame_count is None or not (self.alone if late.any() else out.any()):
             return []
         _LOG.info("tracking again with the refined cameras")
-        seen = retimed_landmarks(self._landmarks(draft), result.frames, late)
+        seen = self._landmarks(draft, late)
         landmarks = {} if seen is None else dict(zip(result.frames.tolist(), seen, strict=True))
         landmarks = {frame: own for frame, own in landmarks.items() if np.isfinite(own).any()}
         done = track_again(first, now, source, task.setup, member.subject, landmarks, self.within)

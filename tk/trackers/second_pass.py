@@ -245,10 +245,12 @@ class SecondPass:
         self._report(min(self._done / (3 * len(self.tracked)), 1.0))
 
     def _pyramid(self, i: int, scales: int = 1) -> Pyramid:
-        """Return the scales of the masks of frame i, and its landmarks."""
-        landmarks = None if self._landmarks is None else self._landmarks[i]
-        if landmarks is not None and not np.isfinite(landmarks).any():
-            landmarks = None
+        """Return the scales of the masks of frame i, and its landmarks, by the cameras that are used."""
+        landmarks = None
+        if self._landmarks is not None:
+            used = np.isfinite(self.residual[i, :, 0])
+            seen = np.where(used[:, None, None], self._landmarks[i], np.nan)
+            landmarks = seen if np.isfinite(seen).any() else None
         return self.tracker.views.pyramid(self._seen(i), scales, False, landmarks)
 
     def _seen(self, i: int) -> NDArray[np.uint8]:

@@ -1,13 +1,13 @@
 """The body fit: rows against finite differences, and a known body recovered from its rendered silhouettes."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
 from tests.model.figures import BODY as AVERAGE
 from tests.model.figures import draw_silhouettes, scaled, surface_points
-from tests.model.landmarks import body_points
+from tests.model.landmarks import body_points, landmarks_of
 from tests.model.ring import ring_of_cameras
 from tk.kernels.cones import CONE
 from tk.kernels.line_search import SearchSettings
@@ -17,7 +17,7 @@ from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_fit import fit_body
 from tk.model.body.body_parameters import BodyFamily, shape_rows
 from tk.model.body.cone_body import SHAPE_NUMBERS, build_cone_body
-from tk.model.body.gait_poses import walking_pose
+from tk.model.body.gait_poses import standing_pose, walking_pose
 from tk.model.body.skeleton import SEGMENTS
 from tk.model.cues.landmarks import LANDMARKS
 from tk.model.cues.ray_costs import Evidence, RayGrid
@@ -167,6 +167,20 @@ def test_lengths_of_a_known_body_are_recovered(monkeypatch):
     ]
     assert np.mean(off) < 0.012
     assert found.dimensions.stature == pytest.approx(true.stature, rel=0.01)
+
+
+def test_landmarks_show_joints_that_silhouettes_of_straight_limbs_do_not():
+    """Upper arms are longer and forearms shorter than average; the arms hang straight."""
+    body = build_cone_body(scaled(AVERAGE.dimensions, upper_arm=1.12, forearm=0.88))
+    pose = standing_pose(body.skeleton)
+    pose[:3] = walk(body, 1)[0, :3]
+    (silhouettes,) = pyramids_of(body, pose[None])
+    ratio = []
+    for landmarks in (None, landmarks_of(VIEWS.rig, body, pose)):
+        found, _ = fit_body(VIEWS, [replace(silhouettes, landmarks=landmarks)], pose[None], SEARCH, STATURE)
+        ratio.append(found.dimensions.upper_arm / found.dimensions.forearm)
+    true = body.dimensions.upper_arm / body.dimensions.forearm
+    assert abs(ratio[1] - true) < 0.85 * abs(ratio[0] - true)
 
 
 def test_shapes_are_recovered_as_mirror_images():

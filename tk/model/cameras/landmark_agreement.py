@@ -1,9 +1,9 @@
-"""Landmarks of several images against each other: whose they are, and whether they confirm a camera.
+"""Compares the landmarks of several images: to whom they belong, and whether they confirm a camera.
 
-The landmarks of the other cameras are triangulated, by consensus. If those of one camera show the same person and the
-camera is right, they lie at the projections of these points, but for the network's errors; else they lie anywhere on a
-person. The logarithm of the ratio of both likelihoods is the evidence. No wrong mask can make a person's joints fit in
-all images.
+The landmarks of the other cameras are triangulated, by consensus. If a camera is right and its landmarks show the same
+person, they lie at the projections of these points, up to the network's errors; else they lie anywhere on a person. The
+logarithm of the ratio of both likelihoods is the evidence. Wrong masks do not make the joints of a person agree in all
+images.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def evidence_for_cameras(rig: Rig, landmarks: Sequence[Float]) -> Float:
 def associated(rig: Rig, landmarks: Float) -> Float:
     """Return landmarks (N, C, L, 3) of N people with each image's sets of landmarks given to the people whom they show.
 
-    A network that is asked for a person who stands behind another one may show that one. A set that fits nobody
-    remains with its person if too few other images show the person to tell.
+    A network that is asked for a person behind another one may show the one in front. A set that fits nobody is
+    dropped. A person whom fewer than two other images show keeps the set, because it cannot be tested.
     """
     result = landmarks.copy()
     for c in range(len(rig)):

@@ -80,7 +80,7 @@ class _Likelihood(NamedTuple):
 
 
 class LandmarkRows(NamedTuple):
-    """What landmarks say of L points of the body at B poses, their offsets integrated out."""
+    """Information of the landmarks about L points of the body at B poses, with their offsets integrated out."""
 
     information: Float  # (B, L, 3, 3) about each point, 1/m²
     pull: Float  # (B, L, 3) the same times the distance to the landmarks, 1/m
@@ -130,7 +130,7 @@ class LandmarkCue:
         return Quadratic(gradient + (matrix @ poses[..., None])[..., 0], matrix)
 
     def rows(self, poses: Float) -> LandmarkRows:
-        """Return what the landmarks say of the body's points at poses (B, D)."""
+        """Return the information of the landmarks about the body's points at poses (B, D)."""
         x = self._skeleton.points(poses, SEGMENT, self._place)
         found = self._likelihood(x)
         spread = np.eye(3) + self._offset[..., None, None] * found.information
@@ -210,11 +210,11 @@ def _normalised(rig: Rig, landmarks: Float) -> Float:
 
 
 def contradiction(rig: Rig, body: ConeBody, pose: Float, seen: Float) -> Float:
-    """Return (J,) variance of the joints' positions along an axis, metres², by which a pose (D,) and the triangulated
-    landmarks (V, L, 3) contradict each other beyond the landmarks' own errors.
+    """Return (J,) variance of the joints' positions along an axis, metres², from the distances between a pose (D,) and
+    the triangulated landmarks (V, L, 3), beyond the landmarks' own errors.
 
-    Either may be right, so half of the squared distance counts. Neck and pelvis have the mean of shoulders and hips,
-    the crown that of the face.
+    Pose or landmark may be right, so half of the squared distance counts. Neck and pelvis have the mean of shoulders
+    and hips, the crown that of the face.
     """
     points, _ = triangulate_joints(rig, seen)
     size = body.dimensions.stature / AVERAGE_STATURE_M
@@ -246,11 +246,11 @@ def propose(rig: Rig, skeleton: Skeleton, seen: Float) -> Float:
 
 
 def of_person(landmarks: Float | None, masks: NDArray[np.uint8]) -> Float | None:
-    """Return the landmarks (V, L, 3) of the person whom masks (V, H, W) show, of those of N people (N, V, L, 3).
+    """Choose, among the landmarks of N people (N, V, L, 3), those (V, L, 3) of the person in masks (V, H, W).
 
-    In each image the box around the visible landmarks is compared with the box around the mask. The landmarks with the
-    largest overlap (intersection over union, mean over the images) are returned, None if it is below
-    :data:`LEAST_OVERLAP`.
+    In each image the box around the visible landmarks is compared with the box around the mask. The person with the
+    largest overlap (intersection over union, mean over the images) is chosen; None if it is below
+    :data:`LEAST_OVERLAP`. Landmarks in images whose mask is empty become NaN.
     """
     if landmarks is None or not len(landmarks):
         return None
