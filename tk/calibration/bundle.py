@@ -1,0 +1,254 @@
+"""Bundle adjustment: intrinsics and poses of cameras, and poses of the board, from the board's points in images.
+
+Levenberg-Marquardt on the project's block least squares: each instant's board pose is a block, the cameras are the
+shared unknowns. The loss is Cauchy's, by iterated weights, so that wrong points count little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.calibration.lens import Model, prior, project
+from tk.calibration.poses import Pose, cross
+from tk.model.block_least_squares import Equations, Reduced
+
+Float = NDArray[np.float64]
+
+#: precision of an unknown that is held
+_HELD = 1e14
+#: Cauchy's scale in standard deviations: its 95 % efficiency on normal noise
+_CAUCHY = 2.385
+#: iterations, and relative decrease of the cost below which they end
+_MOST_ROUNDS, _ENOUGH = 60, 1e-7
+#: time between the images of one instant, frames: synchronised videos are within half a frame of each other
+_UNSYNCHRONISED = 0.29  # standard deviation of a uniform distribution of that width
+#: least noise of a point, pixels
+_LEAST_NOISE_PX = 0.02
+
+
+@dataclass(frozen=True)
+class View:
+    """The board in one image of one camera."""
+
+    camera: int
+    instant: int  # images of the same instant show the same pose of the board
+    points: Float  # (N, 3) on the board, metres
+    pixels: Float  # (N, 2)
+    ids: NDArray[np.int64]  # (N,) numbers of the points
+    motion_px: float = 0.0  # motion of the board in the image from this frame to the next
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsics of a camera, and their prior."""
+
+    model: Model
+    values: Float  # (K,) see tk.calibration.lens
+    start: Float  # (K,) mean of the prior
+    width: int  # of the image, pixels
+    focal_sigma: float  # standard deviation of the prior of the logarithm of the focal length
+    held: NDArray[np.bool_]  # (K,) intrinsics that stay as they are
+
+
+@dataclass(frozen=True)
+class State:
+    """An estimate."""
+
+    lenses: tuple[Lens, ...]
+    cameras: tuple[Pose, ...]  # world to camera
+    boards: Mapping[int, Pose]  # board to world, by instant
+
+    def pose(self, view: View) -> Pose:
+        """Return the pose of the board in a view's camera."""
+        return self.cameras[view.camera] @ self.boards[view.instant]
+
+    def errors(self, view: View) -> Float:
+        """Return (N, 2) detected minus projected pixels of a view's points."""
+        lens = self.lenses[view.camera]
+        return np.asarray(view.pixels - project(lens.model, lens.values, self.pose(view).apply(view.points))[0])
+
+
+@dataclass(frozen=True)
+class Solved:
+    """An adjusted estimate.
+
+    Attributes:
+        state: the estimate.
+        noise_px: standard deviation of a point's pixel along one axis.
+        reduced: normal equations of the shared unknowns at the estimate, in units of the noise.
+        slices: of each camera in the shared unknowns: 6 of the pose (rotation, translation), then its intrinsics.
+        converged: whether the cost stopped decreasing.
+    """
+
+    state: State
+    noise_px: float
+    reduced: Reduced
+    slices: tuple[slice, ...]
+    converged: bool
+
+    def covariance(self) -> Float:
+        """Return (S, S) covariance of the shared unknowns, the larger of two along each eigenvector.
+
+        One assumes independent errors of the points. The other lets the errors of an instant depend on each other, as
+        they do if the board is bent or moved, or the lens model is wrong (White 1980; Liang & Zeger 1986).
+        """
+        S = len(self.reduced.hessian)
+        scale = 1 / np.sqrt(np.diag(self.reduced.hessian))
+        plain = np.linalg.pinv(self.reduced.hessian * np.outer(scale, scale), rcond=1e-14, hermitian=True)
+        plain *= np.outer(scale, scale)
+        scores = self.reduced.by_block
+        n = max(len(scores) - 1, 1)
+        clustered = plain @ (scores.T @ scores) @ plain * (len(scores) / n)
+        root = np.linalg.cholesky(plain + 1e-18 * np.eye(S) * np.trace(plain))
+        inner = np.linalg.solve(root, np.linalg.solve(root, clustered).T)
+        values, vectors = np.linalg.eigh((inner + inner.T) / 2)
+        wide = root @ (vectors * np.maximum(values, 1.0)) @ vectors.T @ root.T
+        return np.asarray((wide + wide.T) / 2)
+
+
+def adjust(start: State, views: Sequence[View], noise_px: float = 1.0, focal_sigma: float | None = None) -> Solved:
+    """Adjust an estimate to the views. The first camera stays where it is; see :class:`State` for the unknowns.
+
+    Args:
+        start: the estimate.
+        views: of cameras and instants that ``start`` has.
+        noise_px: noise of a point to begin with; it is estimated from the residuals.
+        focal_sigma: replaces that of the lenses.
+    """
+    slices, at = [], 0
+    for lens in start.lenses:
+        slices.append(slice(at, at + 6 + lens.model.size))
+        at += 6 + lens.model.size
+    problem = _Problem(tuple(views), tuple(slices), sorted(start.boards))
+    state, converged = start, False
+    for _ in range(4):  # the noise and the estimate depend on each other
+        state, converged = _descend(problem, state, noise_px)
+        found = _noise(problem, state)
+        settled = abs(found / noise_px - 1) < 0.05
+        noise_px = found
+        if settled:
+            break
+    return Solved(state, noise_px, problem.equations(state, noise_px).reduced(), problem.slices, converged)
+
+
+def _descend(problem: _Problem, state: State, noise_px: float) -> tuple[State, bool]:
+    damping, cost = 1e-3, problem.cost(state, noise_px)
+    for _ in range(_MOST_ROUNDS):
+        equations = problem.equations(state, noise_px)
+        while True:
+            try:
+                moved = problem.moved(state, *equations.reduced(damping).step())
+                new = problem.cost(moved, noise_px)
+            except np.linalg.LinAlgError:
+                moved, new = state, np.inf
+            if np.isfinite(new) and new <= cost:
+                break
+            damping *= 8
+            if damping > 1e8:
+                return state, True
+        done = cost - new < _ENOUGH * max(cost, 1e-9)
+        state, cost, damping = moved, new, max(damping / 8, 1e-9)
+        if done:
+            return state, True
+    return state, False
+
+
+def _noise(problem: _Problem, state: State) -> float:
+    """Return the robust standard deviation of the residuals along one axis, pixels, motion removed."""
+    errors = [state.errors(view) / np.sqrt(1 + (_blur(view) / 0.3) ** 2) for view in problem.views]
+    median = np.median(np.abs(np.concatenate(errors)))
+    return max(float(1.4826 * median), _LEAST_NOISE_PX)
+
+
+def _blur(view: View) -> float:
+    """Return the standard deviation of a view's points because its image is not of the exact instant, pixels."""
+    return _UNSYNCHRONISED * view.motion_px
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """The views, and the places of the unknowns."""
+
+    views: tuple[View, ...]
+    slices: tuple[slice, ...]
+    instants: list[int]
+
+    def _variance(self, view: View, noise_px: float) -> float:
+        return float(noise_px**2 + _blur(view) ** 2)
+
+    def cost(self, state: State, noise_px: float) -> float:
+        total = 0.0
+        for view in self.views:
+            squared = (state.errors(view) ** 2).sum(axis=1) / self._variance(view, noise_px)
+            total += 0.5 * _CAUCHY**2 * float(np.log1p(squared / _CAUCHY**2).sum())
+        for lens in state.lenses:
+            H, g = prior(lens.model, lens.values, lens.start, lens.width, lens.focal_sigma)
+            total += 0.5 * float(g @ np.linalg.pinv(H) @ g)
+        return total
+
+    def equations(self, state: State, noise_px: float) -> Equations:
+        """Return the normal equations at an estimate."""
+        equations = Equations(len(self.instants), 6, self.slices[-1].stop)
+        block = {instant: b for b, instant in enumerate(self.instants)}
+        for view in self.views:
+            pixels, rows = linearise(state, view)
+            errors = view.pixels - pixels
+            variance = self._variance(view, noise_px)
+            weight = 1 / (1 + (errors**2).sum(axis=1) / variance / _CAUCHY**2) / variance
+            place = self.slices[view.camera]
+            columns = [slice(0, 6), slice(6 + place.start, 6 + place.stop)]
+            equations.add(
+                block[view.instant], columns, rows.reshape(-1, rows.shape[2]), np.repeat(weight, 2), errors.ravel()
+            )
+        diagonal = np.einsum("ss->s", equations.prior_hessian)
+        for c, (lens, place) in enumerate(zip(state.lenses, self.slices, strict=True)):
+            own = slice(place.start + 6, place.stop)
+            H, g = prior(lens.model, lens.values, lens.start, lens.width, lens.focal_sigma)
+            equations.prior_hessian[own, own] += H
+            equations.prior_gradient[own] += g
+            diagonal[own][lens.held] += _HELD
+            if c == 0:
+                diagonal[place.start : place.start + 6] += _HELD
+            else:  # a camera without views: only keeps the equations regular
+                diagonal[place.start : place.start + 6] += 1e-9
+        for b in range(len(self.instants)):
+            equations.add_block_prior(b, np.full(6, 1e-9), np.zeros(6))
+        return equations
+
+    def moved(self, state: State, blocks: Float, shared: Float) -> State:
+        """Return the estimate after a step."""
+        cameras, lenses = [], []
+        for pose, lens, place in zip(state.cameras, state.lenses, self.slices, strict=True):
+            step = shared[place]
+            cameras.append(pose.moved(_short(step[:6])))
+            limit = 0.3 * lens.values[0]
+            focal_and_middle = np.clip(step[6:10], -limit, limit)
+            values = lens.values + np.where(lens.held, 0.0, np.concatenate([focal_and_middle, step[10:]]))
+            lenses.append(replace(lens, values=values))
+        boards = {i: state.boards[i].moved(_short(step)) for i, step in zip(self.instants, blocks, strict=True)}
+        return State(tuple(lenses), tuple(cameras), boards)
+
+
+def _short(step: Float) -> Float:
+    """Return a step of a pose, shortened to half a radian and two metres."""
+    return np.asarray(step / max(1.0, np.linalg.norm(step[:3]) / 0.5, np.linalg.norm(step[3:]) / 2.0))
+
+
+def linearise(state: State, view: View) -> tuple[Float, Float]:
+    """Return the pixels (N, 2) of a view's points, and their derivatives (N, 2, 12 + K).
+
+    The columns are steps of the board's pose (6), of the camera's pose (6), see :meth:`Pose.moved`, and of the camera's
+    intrinsics (K).
+    """
+    board, camera, lens = state.boards[view.instant], state.cameras[view.camera], state.lenses[view.camera]
+    turned = view.points @ board.rotation.T
+    world = turned + board.translation
+    seen = world @ camera.rotation.T
+    pixels, by_point, by_lens = project(lens.model, lens.values, seen + camera.translation)
+    by_world = by_point @ camera.rotation
+    rows = np.concatenate([-by_world @ cross(turned), by_world, -by_point @ cross(seen), by_point, by_lens], axis=2)
+    return pixels, rows
