@@ -1,7 +1,7 @@
 """Calibrate generated rigs with a rendered board, and compare with the truth.
 
-    python -m scripts.board_rigs                 # the three rigs to develop on
-    python -m scripts.board_rigs --report        # the three rigs to report
+python -m scripts.board_rigs                 # the three rigs to develop on
+python -m scripts.board_rigs --report        # the three rigs to report
 """
 
 from __future__ import annotations
@@ -45,6 +45,10 @@ REPORT = {
     "report5": _rig(_RING5, ["action wide", "action"], 12),
     "report8": _rig(_RING8, ["action", "phone", "webcam", "action wide"], 13),
 }
+
+
+#: sides of squares: boards of about 0.8 m
+_SQUARES_M = {"charuco": 0.11, "chessboard": 0.08, "circles": 0.07, "aprilgrid": 0.09}
 
 
 @dataclass(frozen=True)
@@ -114,7 +118,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--board", default="charuco", help="kind of board")
     parser.add_argument("--keep", type=Path, help="folder for the pictures; they are used again if they are there")
     options = parser.parse_args(arguments)
-    board = make_board(options.board, None, {"charuco": 0.11, "chessboard": 0.08, "circles": 0.07, "aprilgrid": 0.09}[options.board])
+    board = make_board(
+        options.board, None, {"charuco": 0.11, "chessboard": 0.08, "circles": 0.07, "aprilgrid": 0.09}[options.board]
+    )
     print("| rig | cameras | mm | ° | f, % | person, mm | expected, mm | px | verdict | s |")
     print("|---|---|---|---|---|---|---|---|---|---|")
     for name, recipe in (REPORT if options.report else DEVELOPMENT).items():

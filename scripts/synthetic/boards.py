@@ -20,6 +20,8 @@ Float = NDArray[np.float64]
 
 #: texels along a side of a square: a multiple of the modules of all markers, so that edges lie between texels
 _TEXELS = 240
+#: area of a board in the image above which two rays along each side of a pixel do
+_LARGE_PX = 120_000
 #: white plate around the pattern, metres
 _MARGIN_M = 0.02
 #: reflectance of paper, ink, the plate's back
@@ -149,12 +151,13 @@ class BoardCamera:
         else:
             self._background = np.full((camera.height, camera.width, 3), 0.3, np.float32)
 
-    def render(self, pose: Pose | None, rng: np.random.Generator, samples: int = 4) -> NDArray[np.uint8]:
+    def render(self, pose: Pose | None, rng: np.random.Generator) -> NDArray[np.uint8]:
         """Return the RGB image (H, W, 3) with the board in a pose (board to world), or without it."""
         image = self._background.copy()
         box = None if pose is None else self._box(pose)
         if pose is not None and box is not None:
             x0, y0, x1, y1 = box
+            samples = 4 if (x1 - x0) * (y1 - y0) < _LARGE_PX else 2  # modules of several pixels need no more
             shade, cover = np.zeros((y1 - y0, x1 - x0)), np.zeros((y1 - y0, x1 - x0))
             rays = self._rays[y0:y1, x0:x1]
             step_x, step_y = np.gradient(rays, axis=1), np.gradient(rays, axis=0)

@@ -206,7 +206,7 @@ def test_level_writes_up_and_keeps_the_rest(tk: Tk, copy: Path) -> None:
     inferred = open_capture(copy)
     assert any("gives no up" in warning and "tk level" in warning for warning in inferred.warnings)
     assert np.degrees(np.arccos(inferred.up_axis @ R[:, 2])) < 6
-    ran = tk("level", copy)
+    ran = tk("calibrate", copy, "--level")
     assert ran.code == 0 and ran.out.startswith("up = "), ran.err
     opened = open_capture(copy)
     assert not any("up" in warning for warning in opened.warnings)
@@ -214,7 +214,7 @@ def test_level_writes_up_and_keeps_the_rest(tk: Tk, copy: Path) -> None:
     written = (copy / "capture.toml").read_text()
     assert written.startswith("up = [") and written.endswith(text)
     shutil.rmtree(copy / "videos")
-    tk("level", copy).complaint("videos")
+    tk("calibrate", copy, "--level").complaint("videos")
 
 
 @pytest.mark.parametrize(

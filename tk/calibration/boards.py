@@ -67,7 +67,9 @@ class Board:
         """Width and height of the printed pattern, metres."""
         s = self.square_m
         if self.kind == "aprilgrid":
-            return s * (self.columns + (self.columns + 1) * self.marker), s * (self.rows + (self.rows + 1) * self.marker)
+            return s * (self.columns + (self.columns + 1) * self.marker), s * (
+                self.rows + (self.rows + 1) * self.marker
+            )
         if self.kind == "circles":
             return s * (2 * self.columns), s * self.rows
         return s * self.columns, s * self.rows
@@ -173,10 +175,10 @@ def make_board(
     """
     columns, rows = _size(kind, size)
     if not np.isfinite(square_m) or not _LEAST_M <= square_m <= _MOST_M:
-        for unit, factor in (("mm", 1e-3), ("cm", 1e-2)):
-            if _LEAST_M <= square_m * factor <= _MOST_M:
-                hint = f"; if {square_m:g} is in {unit}, give --square {square_m * factor:g}"
-                raise ConfigError(f"--square {square_m:g}: a square of {square_m:g} m; give its side in metres{hint}")
+        units = [(unit, f * square_m) for unit, f in (("mm", 1e-3), ("cm", 1e-2)) if _LEAST_M <= f * square_m <= _MOST_M]
+        if units:
+            hint = ", or ".join(f"--square {metres:g} if it is in {unit}" for unit, metres in units)
+            raise ConfigError(f"--square {square_m:g}: a square of {square_m:g} m; give its side in metres: {hint}")
         raise ConfigError(f"--square {square_m:g}: give the measured side of a square in metres, for example 0.11")
     april = kind == "aprilgrid"
     if marker is None:

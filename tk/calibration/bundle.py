@@ -6,7 +6,7 @@ shared unknowns. The loss is Cauchy's, by iterated weights, so that wrong points
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -123,7 +123,7 @@ def adjust(start: State, views: Sequence[View], noise_px: float = 1.0, focal_sig
     for lens in start.lenses:
         slices.append(slice(at, at + 6 + lens.model.size))
         at += 6 + lens.model.size
-    problem = _Problem(tuple(views), tuple(slices), sorted(start.boards))
+    problem = _Problem(views, tuple(slices), sorted(start.boards))
     state, converged = start, False
     for _ in range(4):  # the noise and the estimate depend on each other
         state, converged = _descend(problem, state, noise_px)
@@ -159,31 +159,73 @@ def _descend(problem: _Problem, state: State, noise_px: float) -> tuple[State, b
 
 def _noise(problem: _Problem, state: State) -> float:
     """Return the robust standard deviation of the residuals along one axis, pixels, motion removed."""
-    errors = [state.errors(view) / np.sqrt(1 + (_blur(view) / 0.3) ** 2) for view in problem.views]
-    median = np.median(np.abs(np.concatenate(errors)))
-    return max(float(1.4826 * median), _LEAST_NOISE_PX)
-
-
-def _blur(view: View) -> float:
-    """Return the standard deviation of a view's points because its image is not of the exact instant, pixels."""
-    return _UNSYNCHRONISED * view.motion_px
+    found = [errors / np.sqrt(1 + (own.blur_px / 0.3) ** 2)[:, None] for own, errors in problem.errors(state)]
+    return max(float(1.4826 * np.median(np.abs(np.concatenate(found)))), _LEAST_NOISE_PX)
 
 
 @dataclass(frozen=True)
+class _Stack:
+    """The points of all views of one camera.
+
+    Attributes:
+        camera: its index.
+        points, pixels: (N, 3), (N, 2) as of a view.
+        block: (N,) index of the board of each point.
+        blur_px: (N,) standard deviation of each pixel because its image is not of the exact instant.
+        views: block and points of each view.
+    """
+
+    camera: int
+    points: Float
+    pixels: Float
+    block: NDArray[np.intp]
+    blur_px: Float
+    views: tuple[tuple[int, slice], ...]
+
+
 class _Problem:
-    """The views, and the places of the unknowns."""
+    """The views by camera, and the places of the unknowns."""
 
-    views: tuple[View, ...]
-    slices: tuple[slice, ...]
-    instants: list[int]
+    def __init__(self, views: Sequence[View], slices: tuple[slice, ...], instants: list[int]) -> None:
+        self.slices, self.instants = slices, instants
+        block = {instant: b for b, instant in enumerate(instants)}
+        self.stacks = []
+        for c in range(len(slices)):
+            own = [view for view in views if view.camera == c]
+            if not own:
+                continue
+            counts = [len(view.points) for view in own]
+            blocks = [block[view.instant] for view in own]
+            ends = np.cumsum(counts).tolist()
+            stack = _Stack(
+                c,
+                np.concatenate([view.points for view in own]),
+                np.concatenate([view.pixels for view in own]),
+                np.repeat(blocks, counts),
+                np.repeat([_UNSYNCHRONISED * view.motion_px for view in own], counts),
+                tuple((b, slice(end - n, end)) for b, n, end in zip(blocks, counts, ends, strict=True)),
+            )
+            self.stacks.append(stack)
 
-    def _variance(self, view: View, noise_px: float) -> float:
-        return float(noise_px**2 + _blur(view) ** 2)
+    def _projected(self, state: State, stack: _Stack, derivatives: bool) -> tuple[Float, Float]:
+        """Return the pixels (N, 2) of a camera's points, and their derivatives (N, 2, 12 + K) or nothing."""
+        boards = [state.boards[i] for i in self.instants]
+        rotations = np.array([pose.rotation for pose in boards])[stack.block]
+        moves = np.array([pose.translation for pose in boards])[stack.block]
+        return linearise(
+            state.lenses[stack.camera], state.cameras[stack.camera], rotations, moves, stack.points, derivatives
+        )
+
+    def errors(self, state: State) -> Iterator[tuple[_Stack, Float]]:
+        """Yield detected minus projected pixels (N, 2) of each camera."""
+        for stack in self.stacks:
+            yield stack, stack.pixels - self._projected(state, stack, False)[0]
 
     def cost(self, state: State, noise_px: float) -> float:
+        """Return the robust cost of an estimate, in units of the noise."""
         total = 0.0
-        for view in self.views:
-            squared = (state.errors(view) ** 2).sum(axis=1) / self._variance(view, noise_px)
+        for stack, errors in self.errors(state):
+            squared = (errors**2).sum(axis=1) / (noise_px**2 + stack.blur_px**2)
             total += 0.5 * _CAUCHY**2 * float(np.log1p(squared / _CAUCHY**2).sum())
         for lens in state.lenses:
             H, g = prior(lens.model, lens.values, lens.start, lens.width, lens.focal_sigma)
@@ -193,17 +235,17 @@ class _Problem:
     def equations(self, state: State, noise_px: float) -> Equations:
         """Return the normal equations at an estimate."""
         equations = Equations(len(self.instants), 6, self.slices[-1].stop)
-        block = {instant: b for b, instant in enumerate(self.instants)}
-        for view in self.views:
-            pixels, rows = linearise(state, view)
-            errors = view.pixels - pixels
-            variance = self._variance(view, noise_px)
-            weight = 1 / (1 + (errors**2).sum(axis=1) / variance / _CAUCHY**2) / variance
-            place = self.slices[view.camera]
+        for stack in self.stacks:
+            pixels, rows = self._projected(state, stack, True)
+            errors = stack.pixels - pixels
+            variance = noise_px**2 + stack.blur_px**2
+            weight = np.repeat(1 / (1 + (errors**2).sum(axis=1) / variance / _CAUCHY**2) / variance, 2)
+            place = self.slices[stack.camera]
             columns = [slice(0, 6), slice(6 + place.start, 6 + place.stop)]
-            equations.add(
-                block[view.instant], columns, rows.reshape(-1, rows.shape[2]), np.repeat(weight, 2), errors.ravel()
-            )
+            for block, part in stack.views:
+                twice = slice(2 * part.start, 2 * part.stop)
+                flat = rows[part].reshape(-1, rows.shape[2])
+                equations.add(block, columns, flat, weight[twice], errors[part].ravel())
         diagonal = np.einsum("ss->s", equations.prior_hessian)
         for c, (lens, place) in enumerate(zip(state.lenses, self.slices, strict=True)):
             own = slice(place.start + 6, place.stop)
@@ -211,10 +253,8 @@ class _Problem:
             equations.prior_hessian[own, own] += H
             equations.prior_gradient[own] += g
             diagonal[own][lens.held] += _HELD
-            if c == 0:
-                diagonal[place.start : place.start + 6] += _HELD
-            else:  # a camera without views: only keeps the equations regular
-                diagonal[place.start : place.start + 6] += 1e-9
+            # the first camera stays; 1e-9 only keeps the equations regular
+            diagonal[place.start : place.start + 6] += _HELD if c == 0 else 1e-9
         for b in range(len(self.instants)):
             equations.add_block_prior(b, np.full(6, 1e-9), np.zeros(6))
         return equations
@@ -238,17 +278,25 @@ def _short(step: Float) -> Float:
     return np.asarray(step / max(1.0, np.linalg.norm(step[:3]) / 0.5, np.linalg.norm(step[3:]) / 2.0))
 
 
-def linearise(state: State, view: View) -> tuple[Float, Float]:
-    """Return the pixels (N, 2) of a view's points, and their derivatives (N, 2, 12 + K).
+def linearise(
+    lens: Lens, camera: Pose, rotations: Float, moves: Float, points: Float, derivatives: bool = True
+) -> tuple[Float, Float]:
+    """Return the pixels (N, 2) of points on boards, and their derivatives (N, 2, 12 + K).
 
     The columns are steps of the board's pose (6), of the camera's pose (6), see :meth:`Pose.moved`, and of the camera's
     intrinsics (K).
+
+    Args:
+        lens, camera: of the camera.
+        rotations, moves: (N, 3, 3), (N, 3) from each point's board to the world.
+        points: (N, 3) on the boards.
+        derivatives: whether to compute them; else the second array is empty.
     """
-    board, camera, lens = state.boards[view.instant], state.cameras[view.camera], state.lenses[view.camera]
-    turned = view.points @ board.rotation.T
-    world = turned + board.translation
-    seen = world @ camera.rotation.T
+    turned = np.einsum("nij,nj->ni", rotations, points)
+    seen = (turned + moves) @ camera.rotation.T
     pixels, by_point, by_lens = project(lens.model, lens.values, seen + camera.translation)
+    if not derivatives:
+        return pixels, np.zeros((0, 2, 0))
     by_world = by_point @ camera.rotation
-    rows = np.concatenate([-by_world @ cross(turned), by_world, -by_point @ cross(seen), by_point, by_lens], axis=2)
-    return pixels, rows
+    parts = [-by_world @ cross(turned), by_world, -by_point @ cross(seen), by_point, by_lens]
+    return pixels, np.concatenate(parts, axis=2)

@@ -78,9 +78,7 @@ def connect(names: Sequence[str], fitted: Sequence[Fitted], links: Sequence[Link
             raise CalibrationError(_unconnected(names, fitted, links, set(cameras)))
     boards: dict[int, Pose] = {}
     for instant in sorted({instant for one in fitted for instant in one.poses}):
-        candidates = [
-            cameras[c].inverse() @ one.poses[instant] for c, one in enumerate(fitted) if instant in one.poses
-        ]
+        candidates = [cameras[c].inverse() @ one.poses[instant] for c, one in enumerate(fitted) if instant in one.poses]
         boards[instant] = _medoid(candidates)
     return State(tuple(one.lens for one in fitted), tuple(cameras[c] for c in range(len(fitted))), boards)
 

@@ -26,6 +26,8 @@ _UNPLANAR = 0.05
 _WINDOW, _LEAST_WINDOW, _MOST_WINDOW = 0.2, 2, 7
 
 
+#: area of a circle in an image: least, pixels; most, share of the image
+_LEAST_BLOB_PX, _MOST_BLOB = 12, 0.02
 #: share of the corners below which markers are tried, too
 _MOST_SHARE = 0.9
 
@@ -114,12 +116,18 @@ def _chessboard(grey: Grey, board: Board) -> tuple[Ids, Float] | None:
 
 
 def _circles(grey: Grey, board: Board) -> tuple[Ids, Float] | None:
-    flags = cv2.CALIB_CB_ASYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING
-    ok, centers = cv2.findCirclesGrid(grey, (board.columns, board.rows), flags=flags)
-    if not ok:
-        return None
-    pixels = np.asarray(centers, np.float64).reshape(-1, 2)
-    return np.arange(len(pixels)), pixels
+    opencv: Any = cv2  # its stubs lack these classes
+    parameters = opencv.SimpleBlobDetector_Params()
+    parameters.minArea, parameters.maxArea = _LEAST_BLOB_PX, _MOST_BLOB * grey.size
+    parameters.minDistBetweenBlobs = 4
+    blobs = opencv.SimpleBlobDetector_create(parameters)
+    size = (board.columns, board.rows)
+    for flags in (cv2.CALIB_CB_ASYMMETRIC_GRID, cv2.CALIB_CB_ASYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING):
+        ok, centers = cv2.findCirclesGrid(grey, size, flags=flags, blobDetector=blobs)
+        if ok:
+            pixels = np.asarray(centers, np.float64).reshape(-1, 2)
+            return np.arange(len(pixels)), pixels
+    return None
 
 
 def _tag_detectors(board: Board) -> list[Any]:

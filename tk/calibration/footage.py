@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -34,7 +35,9 @@ _ALIKE = 0.015
 #: distance of views, share of the image's width, that gains nothing more
 _FAR = 0.3
 #: images kept for the explanation if no board is found, and width of the pictures of the report, pixels
-_SAMPLES, _THUMB_PX = 6, 420
+_SAMPLES, _THUMB_PX = 24, 420
+#: fewest views of a camera: two determine a focal length only in theory
+FEWEST_SEEN = 3
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,8 @@ class Footage:
         video: whether instants are frames of a video; else numbers of pictures.
         instants: searched images, by instant.
         seen: the board, by instant.
-        samples: a few grey images, for the explanation if no board is found.
+        samples: grey images without a board, for the explanation, if there are too few with it.
+        spacing: one of so many images becomes a sample.
     """
 
     name: str
@@ -68,6 +72,7 @@ class Footage:
     instants: list[int] = field(default_factory=list)
     seen: dict[int, Seen] = field(default_factory=dict)
     samples: list[Grey] = field(default_factory=list)
+    spacing: int = 1
 
 
 def list_cameras(folder: Path) -> dict[str, Path]:
@@ -130,7 +135,7 @@ def _images(footage: Footage) -> Iterator[tuple[int, Grey, Grey | None]]:
     """Yield the instants and grey images of a camera, and the frame after each if it is a video."""
     if not footage.video:
         files = [file for file in sorted(footage.path.iterdir()) if _is_picture(file)]
-        numbers = {}
+        numbers: dict[int, Path] = {}
         for file in files:
             number = picture_number(file)
             if number is None:
@@ -139,7 +144,7 @@ def _images(footage: Footage) -> Iterator[tuple[int, Grey, Grey | None]]:
                 raise CalibrationError(f"{footage.path}: {numbers[number].name} and {file.name} have the same number")
             numbers[number] = file
         for number, file in sorted(numbers.items()):
-            grey = read_picture(file, is_mask=True)
+            grey: Grey = read_picture(file, is_mask=True)
             height, width = grey.shape
             if footage.width and (width, height) != (footage.width, footage.height):
                 size = f"{footage.width}×{footage.height}"
@@ -160,7 +165,7 @@ def _images(footage: Footage) -> Iterator[tuple[int, Grey, Grey | None]]:
             pair = []
             for _ in range(2 if step > 1 else 1):
                 reader.read(out)
-                pair.append(cv2.cvtColor(out, cv2.COLOR_BGR2GRAY))
+                pair.append(np.asarray(cv2.cvtColor(out, cv2.COLOR_BGR2GRAY), np.uint8))
                 at += 1
             yield instant, pair[0], pair[1] if len(pair) > 1 else None
     finally:
@@ -173,11 +178,12 @@ def _is_picture(file: Path) -> bool:
 
 def _look(footage: Footage, board: Board, instant: int, grey: Grey, following: Grey | None) -> None:
     footage.instants.append(instant)
-    count = len(footage.instants)
-    if count & (count - 1) == 0 or count % 40 == 0:  # the first ones, then ever fewer
-        footage.samples = [*footage.samples, grey.copy()][-_SAMPLES:]
     found = detect(grey, board)
     if found is None:
+        if len(footage.seen) < FEWEST_SEEN and len(footage.instants) % footage.spacing == 0:
+            footage.samples.append(grey.copy())
+            if len(footage.samples) > _SAMPLES:
+                footage.samples, footage.spacing = footage.samples[1::2], 2 * footage.spacing
         return
     onto, _ = cv2.findHomography(board.points[found.ids, :2], found.pixels)
     outline = cv2.perspectiveTransform(board.corners[None, :, :2], onto)[0]
@@ -186,12 +192,15 @@ def _look(footage: Footage, board: Board, instant: int, grey: Grey, following: G
     picture = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 70])[1].tobytes()
     motion = 0.0 if following is None else _motion(grey, following, found.pixels)
     footage.seen[instant] = Seen(found, outline, motion, picture)
+    if len(footage.seen) >= FEWEST_SEEN:
+        footage.samples = []
 
 
 def _motion(grey: Grey, following: Grey, pixels: Float) -> float:
     """Return the median motion of points from one frame to the next, pixels."""
     before = pixels.astype(np.float32)[:, None]
-    after, ok, _ = cv2.calcOpticalFlowPyrLK(grey, following, before, None, winSize=(15, 15))
+    opencv: Any = cv2  # its stubs do not take None for the first guess
+    after, ok, _ = opencv.calcOpticalFlowPyrLK(grey, following, before, None, winSize=(15, 15))
     moved = np.linalg.norm(after - before, axis=2).ravel()[ok.ravel() == 1]
     return float(np.median(moved)) if len(moved) >= len(pixels) / 2 else _FASTEST_PX + 1
 

@@ -15,9 +15,9 @@ from tk.calibration.poses import IDENTITY, Pose, planar_poses
 Float = NDArray[np.float64]
 
 #: focal lengths to begin with, as shares of the image's width: 115° to 16° of view
-_FOCALS = np.geomspace(0.32, 3.5, 17)
+_FOCALS = np.geomspace(0.32, 3.5, 15)
 #: views for the first focal length, and for a fit of one camera; more change little
-_FIRST_VIEWS, _MOST_VIEWS = 12, 45
+_FIRST_VIEWS, _MOST_VIEWS = 10, 36
 #: parts of the views, each held out once
 _FOLDS = 3
 #: another model than the first must lower the error in held-out views by this share
@@ -58,25 +58,25 @@ def fit_lens(views: Sequence[View], size: tuple[int, int], models: Sequence[Mode
         given: intrinsics that are known.
     """
     if given is not None:
-        poses = _poses(given, views)
+        poses = board_poses(given, views)
         near, far = _range(poses, views)
         return Fitted(given, poses, {}, near, far, "given")
     views = _spread(views, _MOST_VIEWS)
-    starts = {model.name: _first(model, views, size) for model in models}
+    fits = {model.name: _fit(_first(model, views, size), views) for model in models}
     errors: dict[str, float] = {}
     best = models[0]
-    if len(models) > 1 and len(views) >= 2 * FEWEST_VIEWS:
+    if len(models) > 1 and len(views) >= 3 * _FOLDS:
         for model in models:
-            errors[model.name] = _held_out(starts[model.name], views)
+            errors[model.name] = _held_out(fits[model.name][0], views)
             if errors[model.name] < (1 - _BETTER) * errors[best.name]:
                 best = model
-    lens, poses = _fit(starts[best.name], views)
+    lens, poses = fits[best.name]
     near, far = _range(poses, views)
     if far < LEAST_RANGE * near or len(views) < FEWEST_VIEWS:
         # what a few similar views determine: one focal length and the first two terms of the distortion
         held = np.ones(best.size, bool)
         held[[0, 1, 4, 5]] = False
-        lens, poses = _fit(replace(starts[best.name], held=held), views)
+        lens, poses = _fit(replace(lens, values=lens.start, held=held), views)
         near, far = _range(poses, views)
         return Fitted(lens, poses, errors, near, far, "held")
     return Fitted(lens, poses, errors, near, far, "free")
@@ -99,14 +99,14 @@ def _first(model: Model, views: Sequence[View], size: tuple[int, int]) -> Lens:
         values = np.array([share * width] * 2 + middle + [0.0] * (model.size - 4))
         errors = []
         for view in some:
-            found = planar_poses(view.points, undistort(model, values, view.pixels))
+            found = planar_poses(view.points, undistort(model, values, view.pixels), refine=False)
             errors.append(found[0][0] * values[0] if found else 1e3)
         candidates.append((float(np.median(errors)), values))
     _, values = min(candidates, key=lambda pair: pair[0])
     return Lens(model, values, values, width, FOCAL_SIGMA, np.zeros(model.size, bool))
 
 
-def _poses(lens: Lens, views: Sequence[View]) -> dict[int, Pose]:
+def board_poses(lens: Lens, views: Sequence[View]) -> dict[int, Pose]:
     """Return the board's pose in the camera, by instant; views without one are missing."""
     found = {}
     for view in views:
@@ -117,7 +117,7 @@ def _poses(lens: Lens, views: Sequence[View]) -> dict[int, Pose]:
 
 
 def _fit(lens: Lens, views: Sequence[View]) -> tuple[Lens, dict[int, Pose]]:
-    poses = _poses(lens, views)
+    poses = board_poses(lens, views)
     own = [replace(view, camera=0) for view in views if view.instant in poses]
     if not own:
         return lens, {}
@@ -125,12 +125,11 @@ def _fit(lens: Lens, views: Sequence[View]) -> tuple[Lens, dict[int, Pose]]:
     solved = adjust(state, own)
     # poses near a distorted border may have begun in the wrong of two solutions
     lens = solved.state.lenses[0]
-    again = _poses(lens, own)
+    again = board_poses(lens, own)
     better = {
         view.instant: again[view.instant]
         for view in own
-        if view.instant in again
-        and _rms(State((lens,), (IDENTITY,), again), view) < 0.8 * _rms(solved.state, view)
+        if view.instant in again and _rms(State((lens,), (IDENTITY,), again), view) < 0.8 * _rms(solved.state, view)
     }
     if better:
         solved = adjust(State((lens,), (IDENTITY,), {**solved.state.boards, **better}), own, solved.noise_px)
@@ -142,13 +141,13 @@ def _rms(state: State, view: View) -> float:
 
 
 def _held_out(start: Lens, views: Sequence[View]) -> float:
-    """Return the error in views that the fit has not used, pixels: the mean over the views, the worst tenth left out."""
+    """Return the mean error in views that a fit has not used, pixels, the worst tenth left out; ``start`` is near it."""
     errors = []
     for fold in range(_FOLDS):
         lens, _ = _fit(start, [view for k, view in enumerate(views) if k % _FOLDS != fold])
         for view in views[fold::_FOLDS]:
             own = replace(view, camera=0)
-            poses = _poses(lens, [own])
+            poses = board_poses(lens, [own])
             errors.append(_rms(State((lens,), (IDENTITY,), poses), own) if poses else 10.0)
     return float(np.mean(np.sort(errors)[: max(1, round(0.9 * len(errors)))]))
 

@@ -9,6 +9,7 @@ picture. Markers need not be read one by one, so that squares of ten pixels are 
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -43,7 +44,7 @@ def find_lattice(grey: Grey, board: Board) -> tuple[Ids, Float] | None:
     """Return numbers (N,) and pixels (N, 2) of the board's inner corners; None if the board is not found."""
     best: tuple[Ids, Float] | None = None
     for smooth_px, ring_px in _SCALES:
-        found = _find(grey, board, *_saddles(grey, smooth_px, ring_px))
+        found = _find(grey, board, *saddles(grey, smooth_px, ring_px))
         if found is not None and (best is None or len(found[0]) > len(best[0])):
             best = found
         if best is not None and len(best[0]) == len(board.points):
@@ -56,7 +57,7 @@ def find_lattice(grey: Grey, board: Board) -> tuple[Ids, Float] | None:
     if onto is None:
         return None
     off = np.linalg.norm(_through(onto, points) - pixels, axis=1)
-    beside = _through(onto, points + [board.square_m, 0]) - _through(onto, points)
+    beside = _through(onto, points + np.array([board.square_m, 0.0])) - _through(onto, points)
     good = off < _STRAY * np.linalg.norm(beside, axis=1)
     return ids[good], pixels[good]
 
@@ -77,7 +78,7 @@ def _find(grey: Grey, board: Board, points: Float, phases: Float) -> tuple[Ids, 
     return None
 
 
-def _saddles(grey: Grey, smooth_px: float, ring_px: float) -> tuple[Float, Float]:
+def saddles(grey: Grey, smooth_px: float, ring_px: float) -> tuple[Float, Float]:
     """Return saddles (N, 2), strongest first, and the angle (N,) in [0, π) towards which each is bright."""
     g = cv2.GaussianBlur(grey, (0, 0), smooth_px).astype(np.float32)
     xx, yy, xy = (cv2.Sobel(g, cv2.CV_32F, *order, ksize=3) for order in ((2, 0), (0, 2), (1, 1)))
@@ -100,7 +101,8 @@ def _saddles(grey: Grey, smooth_px: float, ring_px: float) -> tuple[Float, Float
     angle = 2 * np.pi * np.arange(_RING) / _RING
     ring = points[:, None] + ring_px * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     values = cv2.remap(g, ring[..., 0].astype(np.float32), ring[..., 1].astype(np.float32), cv2.INTER_LINEAR)
-    middle = cv2.remap(g, *(points[:, None, k].astype(np.float32) for k in (0, 1)), cv2.INTER_LINEAR)[:, 0]
+    at = points[:, None].astype(np.float32)
+    middle = cv2.remap(g, at[..., 0], at[..., 1], cv2.INTER_LINEAR)[:, 0]
     middle = middle - values.mean(axis=1)
     values = values - values.mean(axis=1, keepdims=True)
     spectrum = np.fft.fft(values, axis=1) / _RING
@@ -165,9 +167,9 @@ def _grow(seed: int, points: Float, phases: Float, most: int) -> dict[tuple[int,
             found[axis] = sign * (points[best] - here)
             steps[place] = found
             # the other axis from a finished neighbour, so that the lattice follows perspective
-            for other in ((place[0] + 1, place[1]), (place[0] - 1, place[1]), (place[0], place[1] + 1), (place[0], place[1] - 1)):
+            for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+                other = place[0] + di, place[1] + dj
                 if other in lattice:
-                    di, dj = other[0] - place[0], other[1] - place[1]
                     found[0 if di else 1] = (di + dj) * (points[lattice[other]] - points[best])
             waiting.append(place)
     return lattice
@@ -190,10 +192,10 @@ def _picture(board: Board) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
             border = (last - first) / (size + 2)
             (x0, y0), (x1, y1) = np.rint(first + border).astype(int), np.rint(last - border).astype(int)
             bits[y0:y1, x0:x1] = True
-    return cv2.GaussianBlur(small, (0, 0), _PX / 20), bits
+    return np.asarray(cv2.GaussianBlur(small, (0, 0), _PX / 20), np.float32), bits
 
 
-def _correlation(a: Float, b: Float) -> float:
+def _correlation(a: NDArray[Any], b: NDArray[Any]) -> float:
     """Return the correlation of two samples; 0 if one of them is constant."""
     a, b = a - a.mean(), b - b.mean()
     size = np.sqrt((a @ a) * (b @ b))
@@ -260,7 +262,8 @@ def _registered(grey: Grey, board: Board, ids: Ids, pixels: Float) -> Float:
     onto, _ = cv2.findHomography(points, pixels)
     if onto is None:
         return pixels
-    side = float(np.median(np.linalg.norm(_through(onto, points + [0.5, 0]) - _through(onto, points - [0.5, 0]), axis=1)))
+    half = np.array([0.5, 0.0])
+    side = float(np.median(np.linalg.norm(_through(onto, points + half) - _through(onto, points - half), axis=1)))
     picture = cv2.GaussianBlur(_picture(board)[0], (0, 0), max(_BLUR_PX * _PX / side, 0.1))
     offsets = np.linspace(-_WINDOW, _WINDOW, _SAMPLES)
     around = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
@@ -301,5 +304,5 @@ def _sharpened(grey: Grey, pixels: Float, side: float) -> Float:
     return np.where(moved[:, None], pixels, refined).astype(np.float64)
 
 
-def _through(homography: Float, points: Float) -> Float:
+def _through(homography: NDArray[Any], points: NDArray[Any]) -> Float:
     return np.asarray(cv2.perspectiveTransform(points[:, None], homography)[:, 0], np.float64)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tk.calibration.boards import KINDS, Board, dictionaries, resized
 from tk.calibration.detection import detect
 from tk.calibration.footage import Footage
+from tk.calibration.lattice import saddles
 
 Float = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -20,6 +21,8 @@ Grey = NDArray[np.uint8]
 _FEWEST_MARKERS = 4
 #: a standard deviation of grey levels below which an image shows nothing, and a mean below which it is dark
 _FLAT, _DARK = 4.0, 18.0
+#: images that are searched for other boards
+_LIKELY = 6
 #: sizes of boards that are tried
 _SIZES = range(3, 15)
 #: mean distance of markers from their places on a board of the right size, share of a marker's side
@@ -30,13 +33,12 @@ _SHRUNK = (0.5, 0.25)
 _MARKED = ("charuco", "aprilgrid")
 
 
-def explain_miss(footage: Footage, board: Board, fewest: int, others: Sequence[str] = ()) -> str:
-    """Return why a board is found in fewer than ``fewest`` images of a camera, in one line with the remedy.
+def explain_miss(footage: Footage, board: Board, others: Sequence[str] = ()) -> str:
+    """Return why a board is found in too few images of a camera, in one line with the remedy.
 
     Args:
         footage: of the camera.
         board: the board that was looked for.
-        fewest: number of images with the board that are needed.
         others: further cameras without the board.
     """
     also = f" (nor in {', '.join(others)})" if others else ""
@@ -50,14 +52,16 @@ def explain_miss(footage: Footage, board: Board, fewest: int, others: Sequence[s
 
 
 def _nearest(samples: Sequence[Grey], board: Board) -> str:
-    if all(float(grey.std()) < _FLAT for grey in samples):
+    if samples and all(float(grey.std()) < _FLAT for grey in samples):
         return "the images are of one colour: is the lens covered, or is this the right file?"
+    # images with many corners first: they show a board, if any does
+    likely = sorted(samples, key=lambda grey: -len(saddles(grey, 1.0, 3.5)[0]))[:_LIKELY]
     for look in (_mirrored, _other_board, _blurred):
-        for grey in reversed(samples):
+        for grey in likely if look is not _blurred else samples:
             found = look(grey, board)
             if found:
                 return found
-    if all(float(grey.mean()) < _DARK for grey in samples):
+    if samples and all(float(grey.mean()) < _DARK for grey in samples):
         return "the images are dark: add light"
     return (
         "show the whole board at ten places and more, its squares 20 pixels wide or more; is it the board that --board "
@@ -78,7 +82,7 @@ def _mirrored(grey: Grey, board: Board) -> str | None:
 def _blurred(grey: Grey, board: Board) -> str | None:
     for share in _SHRUNK:
         small = cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
-        if detect(small, board) is not None:
+        if detect(np.asarray(small, np.uint8), board) is not None:
             return (
                 f"one is found at {share:g} of the images' size: they are blurred or noisy: focus the camera, hold the "
                 "board still, add light"
@@ -172,10 +176,6 @@ def _other_patterns(board: Board) -> Iterator[Board]:
         yield resized(board, board.rows, board.columns)
     for kind, (columns, rows) in KINDS.items():
         if kind != board.kind:
-            name = "apriltag_36h11" if kind == "aprilgrid" else "4x4_50"
-            yield replace(
-                board, kind=kind, columns=columns, rows=rows, dictionary=name, marker=0.3 if kind == "aprilgrid" else 0.75
-            )
-
-
-__all__ = ["explain_miss"]
+            april = kind == "aprilgrid"
+            name, marker = ("apriltag_36h11", 0.3) if april else ("4x4_50", 0.75)
+            yield replace(board, kind=kind, columns=columns, rows=rows, dictionary=name, marker=marker)

@@ -45,7 +45,7 @@ def exp(w: Float) -> Float:
 
 def log(rotation: Float) -> Float:
     """Return the rotation vector (3,) of a rotation (3, 3)."""
-    return np.asarray(cv2.Rodrigues(rotation)[0]).ravel()
+    return np.asarray(cv2.Rodrigues(rotation)[0], np.float64).ravel()
 
 
 def angle_deg(a: Float, b: Float) -> float:
@@ -60,7 +60,7 @@ def cross(v: Float) -> Float:
     return out - out.transpose(0, 2, 1)
 
 
-def planar_poses(points: Float, xy: Float) -> list[tuple[float, Pose]]:
+def planar_poses(points: Float, xy: Float, refine: bool = True) -> list[tuple[float, Pose]]:
     """Return the poses of a plane's points (N, 3) that fit normalised coordinates (N, 2), at most two, best first.
 
     A plane far away has two: it may be tilted towards the camera or away from it. Each comes with its
@@ -74,8 +74,9 @@ def planar_poses(points: Float, xy: Float) -> list[tuple[float, Pose]]:
         return []
     found = []
     for turn, move in zip(turns, moves, strict=True):
-        turn, move = cv2.solvePnPRefineLM(points - middle, xy, np.eye(3), None, turn, move)
-        rotation = exp(np.asarray(turn).ravel())
+        if refine:
+            turn, move = cv2.solvePnPRefineLM(points - middle, xy, np.eye(3), None, turn, move)
+        rotation = exp(np.asarray(turn, np.float64))
         pose = Pose(rotation, np.asarray(move).ravel() - rotation @ middle)
         seen = pose.apply(points)
         if np.isfinite(seen).all() and (seen[:, 2] > 0).all():

@@ -11,18 +11,16 @@ from numpy.typing import NDArray
 from tk.calibration.boards import Board
 from tk.calibration.bundle import Lens, Solved, State, View, adjust
 from tk.calibration.connect import Link, connect, find_links
-from tk.calibration.footage import Footage, choose
-from tk.calibration.intrinsics import Fitted, fit_lens
+from tk.calibration.footage import FEWEST_SEEN, Footage, choose
+from tk.calibration.intrinsics import Fitted, board_poses, fit_lens
 from tk.calibration.lens import MODELS, WRITTEN
 from tk.calibration.misses import explain_miss
-from tk.calibration.world import World, moved, place_world
+from tk.calibration.world import World, place_world
 from tk.errors import CalibrationError
 from tk.model.cameras.camera import Camera, Rig
 
 Float = NDArray[np.float64]
 
-#: fewest views of a camera: two determine a focal length only in theory
-_FEWEST = 3
 #: a view contradicts the others if its median error exceeds this many standard deviations, and this many pixels
 _CONTRADICTS, _CONTRADICTS_PX = 5.0, 0.7
 #: most rounds in which contradicting views are removed
@@ -91,16 +89,17 @@ def rig_of(state: State, footages: Sequence[Footage]) -> Rig:
     for footage, lens, pose in zip(footages, state.lenses, state.cameras, strict=True):
         fx, fy, cx, cy = lens.values[:4]
         matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        cameras.append(
-            Camera(
-                footage.name, footage.width, footage.height, matrix, lens.values[4:].copy(), pose.rotation,
-                pose.translation, lens.model.fisheye,
-            )  # fmt: skip
-        )
+        camera = Camera(
+            footage.name, footage.width, footage.height, matrix, lens.values[4:].copy(), pose.rotation,
+            pose.translation, lens.model.fisheye,
+        )  # fmt: skip
+        cameras.append(camera)
     return Rig(tuple(cameras))
 
 
-def calibrate(footages: Sequence[Footage], board: Board, options: Options, progress: Callable[[str], None]) -> Calibrated:
+def calibrate(
+    footages: Sequence[Footage], board: Board, options: Options, progress: Callable[[str], None]
+) -> Calibrated:
     """Calibrate the cameras.
 
     Raises:
@@ -109,18 +108,16 @@ def calibrate(footages: Sequence[Footage], board: Board, options: Options, progr
     for footage in footages:
         if not footage.instants:
             raise CalibrationError(f"{footage.path}: camera {footage.name} has no images")
-    missing = [footage for footage in footages if len(footage.seen) < _FEWEST]
+    missing = [footage for footage in footages if len(footage.seen) < FEWEST_SEEN]
     if missing:
-        raise CalibrationError(explain_miss(missing[0], board, _FEWEST, [other.name for other in missing[1:]]))
+        raise CalibrationError(explain_miss(missing[0], board, [other.name for other in missing[1:]]))
     chosen, notes = choose(footages, options.instants, options.floor)
-    views = [
-        _view(c, instant, board, footages[c]) for instant, cameras in chosen.items() for c in cameras
-    ]
+    views = [_view(c, instant, board, footages[c]) for instant, cameras in chosen.items() for c in cameras]
     fitted = []
     for c, footage in enumerate(footages):
         progress(f"estimating the intrinsics of camera {footage.name}")
         own = [view for view in views if view.camera == c]
-        if len(own) < _FEWEST:
+        if len(own) < FEWEST_SEEN:
             raise CalibrationError(
                 f"camera {footage.name}: too few views: {len(own)} sharp and different ones; show the board at ten "
                 "places and more, tilted, near and far, and hold it still"
@@ -129,7 +126,8 @@ def calibrate(footages: Sequence[Footage], board: Board, options: Options, progr
         models = [MODELS[options.model]] if options.model else list(WRITTEN)
         fitted.append(fit_lens(own, (footage.width, footage.height), models, given))
     for c, one in enumerate(fitted):  # a fit of one camera uses some of its views only
-        fitted[c] = replace(one, poses=_all_poses(one, [view for view in views if view.camera == c]))
+        own = [view for view in views if view.camera == c and view.instant not in one.poses]
+        fitted[c] = replace(one, poses={**board_poses(one.lens, own), **one.poses})
     progress("connecting the cameras")
     links = find_links(fitted) if len(footages) > 1 else []
     names = [footage.name for footage in footages]
@@ -171,12 +169,6 @@ def _given(known: Mapping[str, Camera], footage: Footage) -> Lens:
     fx, fy, (cx, cy) = camera.matrix[0, 0], camera.matrix[1, 1], camera.matrix[:2, 2] + 0.5
     values = np.concatenate([scale * np.array([fx, fy, cx, cy]) - np.array([0, 0, 0.5, 0.5]), distortion])
     return Lens(model, values, values, footage.width, 1.0, np.ones(model.size, bool))
-
-
-def _all_poses(one: Fitted, views: Sequence[View]) -> dict[int, object]:
-    from tk.calibration.intrinsics import _poses
-
-    return {**_poses(one.lens, views), **one.poses}
 
 
 def _adjust(state: State, views: Sequence[View]) -> tuple[Solved, list[View], list[View]]:
@@ -222,6 +214,3 @@ def _check_sides(names: Sequence[str], state: State, views: Sequence[View]) -> N
                 f"camera {names[c]}: the solution is mirrored: {count} boards lie behind it or show their back; are "
                 "its images mirrored?"
             )
-
-
-__all__ = ["Calibrated", "Options", "calibrate", "moved", "rig_of"]

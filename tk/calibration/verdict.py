@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.calibration.bundle import linearise
 from tk.calibration.intrinsics import LEAST_RANGE
-from tk.calibration.lens import prior
+from tk.calibration.lens import prior, project
 from tk.calibration.poses import cross
 from tk.calibration.rig import Calibrated
 from tk.errors import VolumeError
@@ -29,13 +28,13 @@ ERROR_M = (0.010, 0.025)
 #: share of a camera's shared views that contradict the others: good, usable
 CONTRADICTING = (0.15, 0.35)
 #: instants that a camera shares with others: good, usable
-SHARED = (8, 3)
+SHARED = (4, 2)
 #: share of the image with points: good. Outside of it the distortion is extrapolated.
 COVERED = 0.35
 #: relative standard deviation of a focal length: good, usable
 FOCAL = (0.005, 0.02)
 #: share of the volume with a board nearby that two cameras see: good
-FILLED = 0.4
+FILLED = 0.3
 #: a board is near a point within this distance, metres
 _NEAR_M = 0.6
 #: cells of the image, across and down, in which points are counted
@@ -201,8 +200,6 @@ def _expected_error(done: Calibrated, rig: Rig, points: Float, covariance: Float
     G = np.zeros((len(points), 3, len(covariance)))
     H = np.zeros((len(points), 3, 3))
     for c, (lens, camera, place) in enumerate(zip(state.lenses, state.cameras, solved.slices, strict=True)):
-        from tk.calibration.lens import project
-
         turned = there @ camera.rotation.T
         _, by_point, by_lens = project(lens.model, lens.values, turned + camera.translation)
         by_camera = np.concatenate([-by_point @ cross(turned), by_point, by_lens], axis=2)
@@ -216,9 +213,9 @@ def _expected_error(done: Calibrated, rig: Rig, points: Float, covariance: Float
     G, there = np.linalg.solve(H[good], G[good]), there[good]
     modes = np.concatenate([np.tile(np.eye(3), (len(there), 1, 1)), -cross(there - there.mean(axis=0))], axis=2)
     flat = modes.reshape(-1, 6)
-    G = G.reshape(len(flat), -1)
-    G = G - flat @ np.linalg.lstsq(flat, G, rcond=None)[0]
-    return float(np.sqrt(np.einsum("is,st,it->", G, covariance, G) / len(there)))
+    moves = G.reshape(len(flat), -1)
+    moves = moves - flat @ np.linalg.lstsq(flat, moves, rcond=None)[0]
+    return float(np.sqrt(np.einsum("is,st,it->", moves, covariance, moves, optimize=True) / len(there)))
 
 
 def _camera(done: Calibrated, c: int, rig: Rig, points: Float, covariance: Float) -> CameraVerdict:
@@ -245,7 +242,8 @@ def _camera(done: Calibrated, c: int, rig: Rig, points: Float, covariance: Float
     return CameraVerdict(
         footage.name, lens.model.name, len(views), sum(len(view.points) for view in views),
         sum(view.camera == c for view in done.dropped), sum(view.instant in others for view in views), rms,
-        rms / camera.pixels_per_metre(middle), float(lens.values[0]), 0.0 if given else float(sigma[0] / lens.values[0]),
+        rms / camera.pixels_per_metre(middle), float(lens.values[0]),
+        0.0 if given else float(sigma[0] / lens.values[0]),
         _covered(pixels, footage.width, footage.height), fitted.near_m, fitted.far_m, fitted.how, by_prior,
         fitted.held_out_px,
     )  # fmt: skip
@@ -285,18 +283,20 @@ def _reasons(
 
     for one in cameras:
         name = f"camera {one.name}"
-        check(one.rms_px, RMS_PX, f"{name}: its points are {one.rms_px:.2f} px off; is the board flat, the video sharp?")
+        check(
+            one.rms_px, RMS_PX, f"{name}: its points are {one.rms_px:.2f} px off; is the board flat, the video sharp?"
+        )
         if one.how != "given":
             check(
                 one.focal_sigma, FOCAL,
-                f"{name}: its focal length is known to {100 * one.focal_sigma:.1f} % only; show the board near and far, "
-                "and tilted",
+                f"{name}: its focal length is known to {100 * one.focal_sigma:.1f} % only; show the board near "
+                "and far, and tilted",
             )  # fmt: skip
             if one.how == "held":
                 found.append((1, f"{name}: {_held(one)}"))
             elif one.covered < COVERED:
                 found.append((
-                    1, f"{name}: points cover {100 * one.covered:.0f} % of its image; show the board in the corners, too"
+                    1, f"{name}: points cover {100 * one.covered:.0f} % of its image; show the board in its corners"
                 ))  # fmt: skip
         if several:
             check(
@@ -308,12 +308,13 @@ def _reasons(
             if all_views:
                 check(
                     one.contradicting / all_views, CONTRADICTING,
-                    f"{name}: {one.contradicting} of {all_views} views contradict the other cameras{_when(done, one.name)}",
+                    f"{name}: {one.contradicting} of {all_views} views contradict the others{_when(done, one.name)}",
                 )  # fmt: skip
     if several:
         shown = f"{1000 * error:.1f} mm" if np.isfinite(error) else "unknown"
         check(
-            error, ERROR_M, f"the expected error at the person is {shown}; show the board at more places, larger or nearer"
+            error, ERROR_M,
+            f"the expected error at the person is {shown}; show the board at more places, larger or nearer",
         )  # fmt: skip
         if not filled >= FILLED:
             found.append((
@@ -346,6 +347,3 @@ def _when(done: Calibrated, name: str) -> str:
     if bad and good and bad[-1] < good[0]:
         return f", all up to instant {bad[-1]}: was the camera moved there? Use the images after it"
     return ": the board was moved, the images are of other instants, or another board is in view"
-
-
-__all__ = ["CELLS", "LEVELS", "CameraVerdict", "Verdict", "judge", "linearise", "person_points"]

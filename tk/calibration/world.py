@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 
 from tk.calibration.boards import Board
 from tk.calibration.bundle import State
-from tk.calibration.poses import Pose, exp
+from tk.calibration.poses import Pose
 from tk.errors import CalibrationError
 
 Float = NDArray[np.float64]
@@ -20,8 +19,10 @@ Float = NDArray[np.float64]
 _BELOW_M = 0.04
 #: lowest camera above the floor, metres
 _LOWEST_M = 0.05
-#: boards on the floor agree in its normal within this, degrees
-_FLAT_DEG = 3.0
+#: some board is at least this high, metres; boards that all lie on one table show no floor
+_ABOVE_M = 0.4
+#: median sine of the angle between cameras and the floor, largest; difference that decides nothing
+_LEVEL, _SIMILAR = 0.25, 0.04
 #: z of the world is up, out of the printed side: OpenCV's board has z into the paper
 _FLOOR = Pose(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
 
@@ -66,9 +67,11 @@ def place_world(state: State, board: Board, floor: int | None) -> World:
                 "floor, printed side up"
             )
         return World(moved(state, _FLOOR @ state.boards[floor].inverse()), floor, f"the board of instant {floor}")
-    candidates = [i for i, pose in state.boards.items() if _is_floor(pose, state, board)]
-    if candidates:
-        first = min(candidates)
+    tilts = {i: tilt for i, pose in state.boards.items() if (tilt := _floor_tilt(pose, state, board)) is not None}
+    if tilts:
+        # a tilted board at the edge of the volume may be below all others, too: the cameras are not level above it
+        level = min(tilts.values()) + _SIMILAR
+        first = min(i for i, tilt in tilts.items() if tilt <= level)
         placed = moved(state, _FLOOR @ state.boards[first].inverse())
         return World(placed, first, f"the board of instant {first}, recognised as lying on the floor")
     return World(_by_cameras(state, board), None, "the cameras' orientation; no board lies on the floor")
@@ -80,26 +83,21 @@ def _heights(floor: Pose, state: State) -> Float:
     return -floor.inverse().apply(centers)[:, 2]
 
 
-def _is_floor(pose: Pose, state: State, board: Board) -> bool:
-    """Return whether all cameras and all other boards are above a board's plane."""
+def _floor_tilt(pose: Pose, state: State, board: Board) -> float | None:
+    """Return how far the cameras are from level above a board, the median sine; None if it is no floor: cameras or
+    other boards are below it, or nothing is far above it."""
     if _heights(pose, state).min() < _LOWEST_M:
-        return False
+        return None
     inverse = pose.inverse()
-    others = np.concatenate([inverse.apply(other.apply(board.corners)) for other in state.boards.values()])
-    heights = -others[:, 2]
-    span = np.ptp(heights)
-    # a board that is lifted by hand is above others; one alone, or all in one plane, tells nothing
-    return bool(heights.min() > -_BELOW_M and span > 0.3 and _level_enough(pose, state))
-
-
-def _level_enough(pose: Pose, state: State) -> bool:
-    """Return whether cameras are less than 60° from level above this floor: people mount them upright or sideways."""
+    heights = -np.concatenate([inverse.apply(other.apply(board.corners)) for other in state.boards.values()])[:, 2]
+    if heights.min() < -_BELOW_M or heights.max() < _ABOVE_M:
+        return None
     up = -pose.rotation[:, 2]
-    forward = np.array([camera.rotation[2] for camera in state.cameras])
     right = np.array([camera.rotation[0] for camera in state.cameras])
     down = np.array([camera.rotation[1] for camera in state.cameras])
-    level = np.minimum(np.abs(right @ up), np.abs(down @ up))
-    return bool(np.median(level) < 0.35 and np.median(forward @ up) < 0.35)
+    # cameras are mounted upright or sideways; one that looks straight down is level in any case
+    tilt = float(np.median(np.minimum(np.abs(right @ up), np.abs(down @ up))))
+    return tilt if tilt < _LEVEL else None
 
 
 def _by_cameras(state: State, board: Board) -> State:
@@ -123,14 +121,3 @@ def moved(state: State, motion: Pose) -> State:
     back = motion.inverse()
     cameras = tuple(camera @ back for camera in state.cameras)
     return State(state.lenses, cameras, {i: motion @ pose for i, pose in state.boards.items()})
-
-
-def below_floor(names: Sequence[str], state: State) -> list[str]:
-    """Return the cameras that are below the floor."""
-    heights: Mapping[str, float] = {
-        name: float(camera.inverse().translation[2]) for name, camera in zip(names, state.cameras, strict=True)
-    }
-    return [name for name, height in heights.items() if height < _LOWEST_M]
-
-
-__all__ = ["World", "below_floor", "exp", "moved", "place_world"]
