@@ -175,7 +175,9 @@ def make_board(
     """
     columns, rows = _size(kind, size)
     if not np.isfinite(square_m) or not _LEAST_M <= square_m <= _MOST_M:
-        units = [(unit, f * square_m) for unit, f in (("mm", 1e-3), ("cm", 1e-2)) if _LEAST_M <= f * square_m <= _MOST_M]
+        units = [
+            (unit, f * square_m) for unit, f in (("mm", 1e-3), ("cm", 1e-2)) if _LEAST_M <= f * square_m <= _MOST_M
+        ]
         if units:
             hint = ", or ".join(f"--square {metres:g} if it is in {unit}" for unit, metres in units)
             raise ConfigError(f"--square {square_m:g}: a square of {square_m:g} m; give its side in metres: {hint}")

@@ -176,10 +176,10 @@ def _grow(seed: int, points: Float, phases: Float, most: int) -> dict[tuple[int,
 
 
 @lru_cache(maxsize=32)
-def _picture(board: Board) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return the board at :data:`_PX` pixels a square, and which pixels are bits of markers."""
-    fine, scale = 4, 4 * _PX / board.square_m
-    image = np.ones((fine * _PX * board.rows, fine * _PX * board.columns), np.float32)
+def _picture(board: Board, px: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return the board at ``px`` pixels a square, and which pixels are bits of markers."""
+    fine, scale = 4, 4 * px / board.square_m
+    image = np.ones((fine * px * board.rows, fine * px * board.columns), np.float32)
     for shape in board.shapes():
         x0, y0 = round(shape.x * scale), round(shape.y * scale)
         image[y0 : round((shape.y + shape.height) * scale), x0 : round((shape.x + shape.width) * scale)] = 0.0
@@ -188,11 +188,11 @@ def _picture(board: Board) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     if board.kind == "charuco":
         size = board.markers.markerSize
         for corners in board.charuco.getObjPoints():
-            first, last = np.asarray(corners)[[0, 2], :2] * _PX / board.square_m
+            first, last = np.asarray(corners)[[0, 2], :2] * px / board.square_m
             border = (last - first) / (size + 2)
             (x0, y0), (x1, y1) = np.rint(first + border).astype(int), np.rint(last - border).astype(int)
             bits[y0:y1, x0:x1] = True
-    return np.asarray(cv2.GaussianBlur(small, (0, 0), _PX / 20), np.float32), bits
+    return np.asarray(small, np.float32), bits
 
 
 def _correlation(a: NDArray[Any], b: NDArray[Any]) -> float:
@@ -218,7 +218,8 @@ def _place(grey: Grey, board: Board, lattice: dict[tuple[int, int], Float]) -> t
     shape = ((int(size[0]) + 1) * _PX, (int(size[1]) + 1) * _PX)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     flat = cv2.warpPerspective(grey, onto, shape, flags=flags, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
-    (picture, bits), found = _picture(board), []
+    (sharp, bits), found = _picture(board, _PX), []
+    picture = cv2.GaussianBlur(sharp, (0, 0), _PX / 20)  # as images of small squares are
     for turn in range(4):
         part = np.ascontiguousarray(np.rot90(flat, turn))
         spare = (np.array(picture.shape) - part.shape) // _PX
@@ -239,15 +240,17 @@ def _place(grey: Grey, board: Board, lattice: dict[tuple[int, int], Float]) -> t
     return (row + y) * corners[0] + column + x, pixels
 
 
-#: half the window in which a corner is registered, share of a square, and samples along it
-_WINDOW, _SAMPLES = 0.55, 15
+#: half the window in which a corner is registered: share of a square, and most pixels; samples along it
+_WINDOW, _WINDOW_PX, _SAMPLES = 0.55, 12.0, 17
+#: pixels a square of the board's picture
+_FINE_PX = 32
 #: blur of an image that the board's picture gets, pixels
 _BLUR_PX = 0.8
 #: steps of the registration
 _STEPS = 6
 #: squares larger than this, pixels, are no plane's image within the window because of the lens; their corners are found
 #: on their own, away from markers
-_LARGE_PX = 36.0
+_LARGE_PX = 64.0
 #: largest distance of a corner from the plane's image, share of a square
 _STRAY = 0.35
 
@@ -262,21 +265,26 @@ def _registered(grey: Grey, board: Board, ids: Ids, pixels: Float) -> Float:
     onto, _ = cv2.findHomography(points, pixels)
     if onto is None:
         return pixels
-    half = np.array([0.5, 0.0])
-    side = float(np.median(np.linalg.norm(_through(onto, points + half) - _through(onto, points - half), axis=1)))
-    picture = cv2.GaussianBlur(_picture(board)[0], (0, 0), max(_BLUR_PX * _PX / side, 0.1))
-    offsets = np.linspace(-_WINDOW, _WINDOW, _SAMPLES)
+    sides = []
+    for half in np.array([[0.5, 0.0], [0.0, 0.5]]):
+        sides.append(
+            float(np.median(np.linalg.norm(_through(onto, points + half) - _through(onto, points - half), axis=1)))
+        )
+    side = min(sides)  # the shorter one of a tilted board
+    if side > _LARGE_PX:
+        return _sharpened(grey, pixels, side)
+    picture = cv2.GaussianBlur(_picture(board, _FINE_PX)[0], (0, 0), _BLUR_PX * _FINE_PX / side)
+    window = min(_WINDOW, _WINDOW_PX / side)
+    offsets = np.linspace(-window, window, _SAMPLES)
     around = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
-    weight = np.exp(-0.5 * (np.linalg.norm(around, axis=1) / (0.6 * _WINDOW)) ** 2)
+    weight = np.exp(-0.5 * (np.linalg.norm(around, axis=1) / (0.6 * window)) ** 2)
     there = points[:, None] + around  # (N, K, 2)
-    texel = (there * _PX - 0.5).astype(np.float32)
+    texel = (there * _FINE_PX - 0.5).astype(np.float32)
     wanted = cv2.remap(picture, texel[..., 0], texel[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     wanted = wanted - (wanted @ weight / weight.sum())[:, None]
     base = _through(onto, there.reshape(-1, 2)).reshape(there.shape) - _through(onto, points)[:, None]
     image = grey.astype(np.float32)
     gx, gy = cv2.Sobel(image, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(image, cv2.CV_32F, 0, 1) / 8
-    if side > _LARGE_PX:
-        return _sharpened(grey, pixels, side)
     found = pixels.copy()
     for _ in range(_STEPS):
         at = (base + found[:, None]).astype(np.float32)
@@ -297,7 +305,7 @@ def _registered(grey: Grey, board: Board, ids: Ids, pixels: Float) -> Float:
 
 def _sharpened(grey: Grey, pixels: Float, side: float) -> Float:
     """Return corners (N, 2) of large squares refined by the directions of edges near them."""
-    half = int(np.clip(0.1 * side, 3, 8))
+    half = int(np.clip(0.09 * side, 3, 8))
     done = cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-3
     refined = cv2.cornerSubPix(grey, pixels.astype(np.float32)[:, None].copy(), (half, half), (-1, -1), done)[:, 0]
     moved = np.linalg.norm(refined - pixels, axis=1) > half

@@ -276,4 +276,8 @@ def _held_out(one: CameraVerdict) -> str:
 
 
 def _by_images(one: CameraVerdict) -> str:
-    return {"given": "none: --intrinsics", "held": "focal length, k1, k2", "free": "all others" if one.by_prior else "all"}[one.how]
+    return {
+        "given": "none: --intrinsics",
+        "held": "focal length, k1, k2",
+        "free": "all others" if one.by_prior else "all",
+    }[one.how]

@@ -460,6 +460,6 @@ def _findings(found: Inspection, capture: Capture, agreement: Agreement) -> list
     if tilt > _TILTED_DEG:
         lines.append(
             f"up = {capture.up} differs by {tilt:.0f}° from the estimate from cameras and person, {found.leveling.up}: "
-            "tk level writes the estimate to capture.toml"
+            "tk calibrate --level writes the estimate to capture.toml"
         )
     return lines

@@ -390,7 +390,7 @@ def _up(settings: CaptureSettings, rig: Rig, path: Path, warn: Callable[[str], N
     found = infer_up(rig)
     if up_vector(found.up) @ up_vector(DEFAULT_UP) > np.cos(np.radians(_UP_DEG)):
         return DEFAULT_UP
-    warn(f"{path / 'capture.toml'}: gives no up; {found.up} is taken, {found.how}; tk level looks closer")
+    warn(f"{path / 'capture.toml'}: gives no up; {found.up} is taken, {found.how}; tk calibrate --level looks closer")
     return found.up
 
 
