@@ -40,7 +40,8 @@ def test_true_cameras_are_found_and_called_good(good: tuple[Calibrated, Verdict]
 
 
 def test_lens_is_chosen_by_held_out_views() -> None:
-    fisheye = replace(RIG[2], fisheye=True, distortions=np.array([0.04, 0.01, -0.01, 0.003]))
+    wide = np.array([[330.0, 0, 400], [0, 330, 300], [0, 0, 1]])
+    fisheye = replace(RIG[2], fisheye=True, distortions=np.array([0.04, 0.01, -0.01, 0.003]), matrix=wide)
     done, _ = run([see(fisheye, POSES, 2), see(RIG[0], POSES, 0)], Options())
     assert [one.lens.model.name for one in done.fitted] == ["fisheye", "pinhole5"]
 
@@ -57,10 +58,12 @@ def test_similar_distances_hold_part_of_the_intrinsics() -> None:
     recorded = footages()
     far = [i for i in recorded[1].seen if 0 < i < 100]
     recorded[1] = keep(recorded[1], *far)
-    done, verdict = run(recorded)
+    _, verdict = run(recorded)
     one = verdict.cameras[1]
     assert one.how == "held" and {"p1", "p2", "k3", "cx", "cy"} <= set(one.by_prior)
-    assert verdict.word != "good" and any("camera cam2" in text and "factor of 2" in text for _, text in verdict.reasons)
+    assert verdict.word != "good" and any(
+        "camera cam2" in text and "factor of 2" in text for _, text in verdict.reasons
+    )
 
 
 def test_camera_without_shared_instants_is_named() -> None:
@@ -73,7 +76,9 @@ def test_camera_without_shared_instants_is_named() -> None:
 def test_camera_with_two_views_is_named() -> None:
     recorded = footages()
     recorded[0] = keep(recorded[0], 100, 101)
-    with pytest.raises(CalibrationError, match="camera cam1: too few views: the board charuco 7x5 of 4x4_50 is in 2 of"):
+    with pytest.raises(
+        CalibrationError, match="camera cam1: too few views: the board charuco 7x5 of 4x4_50 is in 2 of"
+    ):
         run(recorded)
 
 
@@ -93,7 +98,8 @@ def test_camera_that_was_moved_is_named() -> None:
     recorded[1] = see(RIG[1], {i: turn @ pose if 9 <= i < 100 else pose for i, pose in POSES.items()}, 1)
     _, verdict = run(recorded)
     assert verdict.word != "good"
-    assert any("camera cam2" in text and "contradict" in text for _, text in verdict.reasons), verdict.reasons
+    blamed = [text for _, text in verdict.reasons if "contradict" in text]
+    assert blamed and all(text.startswith("camera cam2") for text in blamed), verdict.reasons
 
 
 def test_mirrored_camera_is_refused() -> None:

@@ -1,4 +1,4 @@
-"""`tk calibrate --refine` and what `tk track` does by itself: a rendered capture whose cameras are off, a video that is late."""
+"""`tk calibrate --refine` and what `tk track` does by itself: cameras that are off, a video that is late."""
 
 from __future__ import annotations
 

@@ -141,7 +141,8 @@ def _rms(state: State, view: View) -> float:
 
 
 def _held_out(start: Lens, views: Sequence[View]) -> float:
-    """Return the mean error in views that a fit has not used, pixels, the worst tenth left out; ``start`` is near it."""
+    """Return the mean error in views that a fit has not used, pixels, the worst tenth left out; a fit begins at
+    ``start``."""
     errors = []
     for fold in range(_FOLDS):
         lens, _ = _fit(start, [view for k, view in enumerate(views) if k % _FOLDS != fold])

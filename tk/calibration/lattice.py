@@ -52,6 +52,9 @@ def find_lattice(grey: Grey, board: Board) -> tuple[Ids, Float] | None:
     if best is None:
         return None
     ids, pixels = best[0], _registered(grey, board, *best)
+    ids, pixels = ids[np.isfinite(pixels[:, 0])], pixels[np.isfinite(pixels[:, 0])]
+    if len(ids) < 4:
+        return None
     points = board.points[ids, :2]
     onto, _ = cv2.findHomography(points, pixels, cv2.LMEDS)
     if onto is None:
@@ -246,6 +249,8 @@ _WINDOW, _WINDOW_PX, _SAMPLES = 0.55, 12.0, 17
 _FINE_PX = 32
 #: blur of an image that the board's picture gets, pixels
 _BLUR_PX = 0.8
+#: correlation of the image around a corner with the board's picture below which something hides the corner
+_ALIKE = 0.85
 #: steps of the registration
 _STEPS = 6
 #: squares larger than this, pixels, are no plane's image within the window because of the lens; their corners are found
@@ -256,7 +261,7 @@ _STRAY = 0.35
 
 
 def _registered(grey: Grey, board: Board, ids: Ids, pixels: Float) -> Float:
-    """Return the corners (N, 2), each moved so that the board's picture around it fits the image.
+    """Return the corners (N, 2), each moved so that the board's picture around it fits the image; NaN if it does not.
 
     In images of small squares a marker's edge is two pixels from the corner. The picture has this edge, too, so it
     does not move the corner.
@@ -299,8 +304,10 @@ def _registered(grey: Grey, board: Board, ids: Ids, pixels: Float) -> Float:
         b = np.einsum("nka,nk,k->na", rows, gain[:, None] * wanted - seen, weight)
         step = np.linalg.solve(A, b[:, :, None])[:, :, 0]
         found += np.clip(step, -1.0, 1.0)
-    lost = np.linalg.norm(found - pixels, axis=1) > max(2.0, 0.2 * side)
-    return np.where(lost[:, None], pixels, found)
+    energy = np.sqrt(((seen * seen) @ weight) * ((wanted * wanted) @ weight))
+    hidden = ((seen * wanted) @ weight) < _ALIKE * energy
+    lost = hidden | (np.linalg.norm(found - pixels, axis=1) > max(2.0, 0.2 * side))
+    return np.where(lost[:, None], np.nan, found)
 
 
 def _sharpened(grey: Grey, pixels: Float, side: float) -> Float:

@@ -22,14 +22,14 @@ _FEWEST_MARKERS = 4
 #: a standard deviation of grey levels below which an image shows nothing, and a mean below which it is dark
 _FLAT, _DARK = 4.0, 18.0
 #: images that are searched for other boards
-_LIKELY = 6
+_LIKELY = 4
 #: sizes of boards that are tried
 _SIZES = range(3, 15)
 #: mean distance of markers from their places on a board of the right size, share of a marker's side
 _FITS = 0.25
 #: images are searched at these shares of their size: blur disappears
-_SHRUNK = (0.5, 0.25)
-#: a border of this many markers that are read at these borders; tags of Kalibr have two
+_SHRUNK = (0.5, 0.25, 0.125)
+#: boards with markers
 _MARKED = ("charuco", "aprilgrid")
 
 
@@ -103,10 +103,10 @@ def _other_board(grey: Grey, board: Board) -> str | None:
     best, most = "", _FEWEST_MARKERS - 1
     for name in dictionaries():
         if name != board.dictionary and name == name.lower() and not name.endswith(("_100", "_250", "_1000")):
-            for kind in _MARKED:
-                found = len(_markers(grey, replace(board, kind=kind), name))
-                if found > most:
-                    best, most = name, found
+            kind = "aprilgrid" if name.startswith("apriltag") else "charuco"
+            found = len(_markers(grey, replace(board, kind=kind), name))
+            if found > most:
+                best, most = name, found
     if best:
         return f"{most} markers of another dictionary are found: give --dictionary {best}"
     for other in _other_patterns(board):

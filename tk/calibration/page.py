@@ -232,9 +232,10 @@ def _plans(done: Calibrated) -> str:
             rim = [camera.center + 0.35 * camera.rotation.T @ np.array([s * reach[0], 0.0, 1.0]) for s in (-1, 1)]
             sight = " ".join(map(at, [camera.center, *rim]))
             x, y = at(camera.center).split(",")
+            name = html.escape(camera.name)
             drawn.append(
                 f'<polygon points="{sight}" fill="#d35400" opacity="0.75"/>'
-                f'<text x="{x}" y="{float(y) - 6:.1f}" font-size="13" text-anchor="middle">{html.escape(camera.name)}</text>'
+                f'<text x="{x}" y="{float(y) - 6:.1f}" font-size="13" text-anchor="middle">{name}</text>'
             )
         picture = _svg(width, height, "".join(drawn))
         plans.append(f"<figure><figcaption>{title}</figcaption>{picture}</figure>")

@@ -218,6 +218,25 @@ def _expected_error(done: Calibrated, rig: Rig, points: Float, covariance: Float
     return float(np.sqrt(np.einsum("is,st,it->", moves, covariance, moves, optimize=True) / len(there)))
 
 
+def _blame(done: Calibrated) -> list[list[int]]:
+    """Return for each camera the instants whose contradiction it explains.
+
+    Two cameras that contradict each other do not tell which one is wrong. The camera that takes part in most
+    contradictions explains them, then the one in most of the others, and so on.
+    """
+    members: dict[int, set[int]] = {view.instant: set() for view in done.dropped}
+    for view in (*done.views, *done.dropped):
+        if view.instant in members:
+            members[view.instant].add(view.camera)
+    found: list[list[int]] = [[] for _ in done.names]
+    while members:
+        counts = [sum(c in cameras for cameras in members.values()) for c in range(len(found))]
+        worst = int(np.argmax(counts))
+        found[worst] = sorted(instant for instant, cameras in members.items() if worst in cameras)
+        members = {instant: cameras for instant, cameras in members.items() if worst not in cameras}
+    return found
+
+
 def _camera(done: Calibrated, c: int, rig: Rig, points: Float, covariance: Float) -> CameraVerdict:
     state, fitted, footage = done.solved.state, done.fitted[c], done.footages[c]
     views = [view for view in done.views if view.camera == c]
@@ -237,11 +256,13 @@ def _camera(done: Calibrated, c: int, rig: Rig, points: Float, covariance: Float
     undetermined = lens.held | (sigma > _DETERMINED * before)
     given = fitted.how == "given"
     by_prior = () if given else tuple(name for name, bad in zip(names, undetermined, strict=True) if bad)
-    others = {view.instant for view in done.views if view.camera != c}
+    others = {view.instant for view in (*done.views, *done.dropped) if view.camera != c}
+    shared = {v.instant for v in (*done.views, *done.dropped) if v.camera == c} & others
+    blamed = _blame(done)[c]
     pixels = np.concatenate([view.pixels for view in views]) if views else np.zeros((0, 2))
     return CameraVerdict(
         footage.name, lens.model.name, len(views), sum(len(view.points) for view in views),
-        sum(view.camera == c for view in done.dropped), sum(view.instant in others for view in views), rms,
+        len(blamed), len(shared - set(blamed)), rms,
         rms / camera.pixels_per_metre(middle), float(lens.values[0]),
         0.0 if given else float(sigma[0] / lens.values[0]),
         _covered(pixels, footage.width, footage.height), fitted.near_m, fitted.far_m, fitted.how, by_prior,
@@ -339,9 +360,9 @@ def _held(one: CameraVerdict) -> str:
 def _when(done: Calibrated, name: str) -> str:
     """Return a guess at why views contradict the others, from when they were taken."""
     c = done.names.index(name)
-    bad = sorted(view.instant for view in done.dropped if view.camera == c)
+    bad = _blame(done)[c]
     others = {view.instant for view in done.views if view.camera != c}
-    good = sorted(view.instant for view in done.views if view.camera == c and view.instant in others)
+    good = sorted({view.instant for view in done.views if view.camera == c} & others - set(bad))
     if bad and good and bad[0] > good[-1]:
         return f", all from instant {bad[0]} on: was the camera moved there? Calibrate again with the images after it"
     if bad and good and bad[-1] < good[0]:
