@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scripts.board_rigs import compare
-from scripts.synthetic.boards import true_world
+from scripts.synthetic.boards import make_rig, place_boards, true_world
 from tests.calibration.rigs import BOARD, POSES, QUICK, RECIPE, RIG, footages, keep, see
 from tk.calibration.boards import make_board
 from tk.calibration.footage import Footage
@@ -40,9 +40,10 @@ def test_true_cameras_are_found_and_called_good(good: tuple[Calibrated, Verdict]
 
 
 def test_lens_is_chosen_by_held_out_views() -> None:
-    wide = np.array([[330.0, 0, 400], [0, 330, 300], [0, 0, 1]])
-    fisheye = replace(RIG[2], fisheye=True, distortions=np.array([0.04, 0.01, -0.01, 0.003]), matrix=wide)
-    done, _ = run([see(fisheye, POSES, 2), see(RIG[0], POSES, 0)], Options())
+    recipe = replace(RECIPE, cameras=((30, 3.2, 1.4, "action wide"), (85, 3.4, 2.0, "webcam")))
+    rig = make_rig(recipe)
+    poses = place_boards(recipe, rig, BOARD)
+    done, _ = run([see(camera, poses, c, noise_px=0.02) for c, camera in enumerate(rig)], Options())
     assert [one.lens.model.name for one in done.fitted] == ["fisheye", "pinhole5"]
 
 

@@ -229,9 +229,11 @@ def _blame(done: Calibrated) -> list[list[int]]:
         if view.instant in members:
             members[view.instant].add(view.camera)
     found: list[list[int]] = [[] for _ in done.names]
+    taken = [sum(view.camera == c for view in (*done.views, *done.dropped)) for c in range(len(found))]
     while members:
         counts = [sum(c in cameras for cameras in members.values()) for c in range(len(found))]
-        worst = int(np.argmax(counts))
+        # of two with as many, the one with fewer other views
+        worst = max(range(len(found)), key=lambda c: (counts[c], counts[c] / max(taken[c], 1)))
         found[worst] = sorted(instant for instant, cameras in members.items() if worst in cameras)
         members = {instant: cameras for instant, cameras in members.items() if worst not in cameras}
     return found

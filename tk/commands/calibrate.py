@@ -7,12 +7,13 @@ from typing import Any
 
 import click
 
-from tk.calibration.boards import KINDS
 from tk.commands import base
 from tk.commands.console import ConsoleReporter
 from tk.errors import CalibrationError, ConfigError
 
 _DEFAULT_OUTPUT = Path("calibration.toml")
+#: tk.calibration.boards.KINDS, without its imports
+_BOARDS = ("charuco", "chessboard", "circles", "aprilgrid")
 #: the options of each way to calibrate, by their Python names
 _OF_BOARD = ("board", "size", "marker", "dictionary")
 _OF_WAY = {
@@ -36,7 +37,7 @@ _OF_WAY = {
 )
 @click.argument("folder", type=base.PATH, required=False, metavar="BOARDS|CAPTURE")
 @click.option("-o", "--output", type=base.PATH, metavar="FILE", help="New calibration.  [default: calibration.toml]")
-@click.option("--board", type=click.Choice(list(KINDS)), default="charuco", show_default=True, help="Kind of board.")
+@click.option("--board", type=click.Choice(_BOARDS), default="charuco", show_default=True, help="Kind of board.")
 @click.option(
     "--square", type=float, metavar="M", help="Measured side of a square, metres (circles: between two rows)."
 )
