@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -181,8 +181,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
             good = all(part in text for part in fault.parts) and (fault.name == "none" or " good:" not in f" {text}")
             print(f"| {fault.name} | {code} | {'yes' if good else 'NO'} | {text} |", flush=True)
 
-
-__all__ = ["FAULTS", "answer", "replace"]
 
 if __name__ == "__main__":
     main()

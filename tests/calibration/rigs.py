@@ -21,7 +21,7 @@ Float = NDArray[np.float64]
 BOARD = make_board("charuco", None, 0.11)
 RECIPE = Recipe(
     ((30, 3.2, 1.4, "phone"), (85, 3.4, 2.0, "webcam"), (150, 3.2, 1.6, "action")),
-    size=(800, 600), shared=16, close=7, seed=5,
+    size=(800, 600), shared=14, close=6, seed=5,
 )  # fmt: skip
 RIG = make_rig(RECIPE)
 POSES = place_boards(RECIPE, RIG, BOARD)

@@ -25,7 +25,7 @@ _CAUCHY = 2.385
 #: iterations, and relative decrease of the cost below which they end
 _MOST_ROUNDS, _ENOUGH = 60, 1e-7
 #: time between the images of one instant, frames: synchronised videos are within half a frame of each other
-_UNSYNCHRONISED = 0.29  # standard deviation of a uniform distribution of that width
+UNSYNCHRONISED = 0.29  # standard deviation of a uniform distribution of that width
 #: least noise of a point, pixels
 _LEAST_NOISE_PX = 0.02
 
@@ -110,14 +110,13 @@ class Solved:
         return np.asarray((wide + wide.T) / 2)
 
 
-def adjust(start: State, views: Sequence[View], noise_px: float = 1.0, focal_sigma: float | None = None) -> Solved:
+def adjust(start: State, views: Sequence[View], noise_px: float = 1.0) -> Solved:
     """Adjust an estimate to the views. The first camera stays where it is; see :class:`State` for the unknowns.
 
     Args:
         start: the estimate.
         views: of cameras and instants that ``start`` has.
         noise_px: noise of a point to begin with; it is estimated from the residuals.
-        focal_sigma: replaces that of the lenses.
     """
     slices, at = [], 0
     for lens in start.lenses:
@@ -202,7 +201,7 @@ class _Problem:
                 np.concatenate([view.points for view in own]),
                 np.concatenate([view.pixels for view in own]),
                 np.repeat(blocks, counts),
-                np.repeat([_UNSYNCHRONISED * view.motion_px for view in own], counts),
+                np.repeat([UNSYNCHRONISED * view.motion_px for view in own], counts),
                 tuple((b, slice(end - n, end)) for b, n, end in zip(blocks, counts, ends, strict=True)),
             )
             self.stacks.append(stack)

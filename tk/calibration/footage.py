@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -252,8 +251,3 @@ def choose(footages: Sequence[Footage], most: int, always: int | None = None) ->
                     apart = np.linalg.norm(footages[c].seen[i].outline - outline, axis=1).mean() / width[c]
                     nearest[c, i] = min(nearest[c, i], float(apart))
     return dict(sorted(chosen.items())), left_out
-
-
-def natural(name: str) -> list[int | str]:
-    """Return a key that sorts names with numbers as people do."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.calibration.boards import Board
-from tk.calibration.bundle import Lens, Solved, State, View, adjust
+from tk.calibration.bundle import UNSYNCHRONISED, Lens, Solved, State, View, adjust
 from tk.calibration.connect import Link, connect, find_links
 from tk.calibration.footage import FEWEST_SEEN, Footage, choose
 from tk.calibration.intrinsics import Fitted, board_poses, fit_lens
@@ -179,7 +179,7 @@ def _adjust(state: State, views: Sequence[View]) -> tuple[Solved, list[View], li
         # of one instant the worst view only: it may have moved the board of the others
         worst: dict[int, tuple[float, View]] = {}
         for view in kept:
-            blur = 0.29 * view.motion_px
+            blur = UNSYNCHRONISED * view.motion_px
             error = float(np.median(np.linalg.norm(solved.state.errors(view), axis=1)))
             limit = max(_CONTRADICTS * float(np.hypot(solved.noise_px, blur)), _CONTRADICTS_PX)
             if error > limit and error > worst.get(view.instant, (0.0, view))[0]:

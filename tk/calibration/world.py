@@ -63,8 +63,8 @@ def place_world(state: State, board: Board, floor: int | None) -> World:
         low = [c for c, h in enumerate(_heights(state.boards[floor], state)) if h < _LOWEST_M]
         if low:
             raise CalibrationError(
-                f"--floor {floor}: {len(low)} cameras are below this board; name an instant in which it lies on the "
-                "floor, printed side up"
+                f"--floor {floor}: {len(low)} of {len(state.cameras)} cameras are below this board; name an instant in "
+                "which it lies on the floor, printed side up"
             )
         return World(moved(state, _FLOOR @ state.boards[floor].inverse()), floor, f"the board of instant {floor}")
     tilts = {i: tilt for i, pose in state.boards.items() if (tilt := _floor_tilt(pose, state, board)) is not None}
