@@ -22,8 +22,8 @@ Float = NDArray[np.float64]
 _HELD = 1e14
 #: Cauchy's scale in standard deviations: its 95 % efficiency on normal noise
 _CAUCHY = 2.385
-#: iterations, and relative decrease of the cost below which they end
-_MOST_ROUNDS, _ENOUGH = 60, 1e-7
+#: iterations, and relative decrease of the cost below which they end; the same while the noise is unknown
+_MOST_ROUNDS, _ENOUGH, _ROUGH = 60, 1e-7, 1e-3
 #: time between the images of one instant, frames: synchronised videos are within half a frame of each other
 UNSYNCHRONISED = 0.29  # standard deviation of a uniform distribution of that width
 #: least noise of a point, pixels
@@ -124,17 +124,17 @@ def adjust(start: State, views: Sequence[View], noise_px: float = 1.0) -> Solved
         at += 6 + lens.model.size
     problem = _Problem(views, tuple(slices), sorted(start.boards))
     state, converged = start, False
-    for _ in range(4):  # the noise and the estimate depend on each other
-        state, converged = _descend(problem, state, noise_px)
+    for k in range(4):  # the noise and the estimate depend on each other
+        state, converged = _descend(problem, state, noise_px, _ENOUGH if k else _ROUGH)
         found = _noise(problem, state)
-        settled = abs(found / noise_px - 1) < 0.05
+        settled = k > 0 and abs(found / noise_px - 1) < 0.1
         noise_px = found
         if settled:
             break
     return Solved(state, noise_px, problem.equations(state, noise_px).reduced(), problem.slices, converged)
 
 
-def _descend(problem: _Problem, state: State, noise_px: float) -> tuple[State, bool]:
+def _descend(problem: _Problem, state: State, noise_px: float, enough: float) -> tuple[State, bool]:
     damping, cost = 1e-3, problem.cost(state, noise_px)
     for _ in range(_MOST_ROUNDS):
         equations = problem.equations(state, noise_px)
@@ -149,7 +149,7 @@ def _descend(problem: _Problem, state: State, noise_px: float) -> tuple[State, b
             damping *= 8
             if damping > 1e8:
                 return state, True
-        done = cost - new < _ENOUGH * max(cost, 1e-9)
+        done = cost - new < enough * max(cost, 1e-9)
         state, cost, damping = moved, new, max(damping / 8, 1e-9)
         if done:
             return state, True
