@@ -22,7 +22,7 @@ _LOWEST_M = 0.05
 #: some board is at least this high, metres; boards that all lie on one table show no floor
 _ABOVE_M = 0.4
 #: median sine of the angle between cameras and the floor, largest; difference that decides nothing
-_LEVEL, _SIMILAR = 0.25, 0.04
+_LEVEL, _SIMILAR = 0.09, 0.02
 #: z of the world is up, out of the printed side: OpenCV's board has z into the paper
 _FLOOR = Pose(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
 
@@ -74,7 +74,8 @@ def place_world(state: State, board: Board, floor: int | None) -> World:
         first = min(i for i, tilt in tilts.items() if tilt <= level)
         placed = moved(state, _FLOOR @ state.boards[first].inverse())
         return World(placed, first, f"the board of instant {first}, recognised as lying on the floor")
-    return World(_by_cameras(state, board), None, "the cameras' orientation; no board lies on the floor")
+    how = "the cameras' orientation; no board lies on the floor for sure: name one with --floor, or use --level"
+    return World(_by_cameras(state, board), None, how)
 
 
 def _heights(floor: Pose, state: State) -> Float:
