@@ -7,6 +7,7 @@ import click
 from tk import __version__
 from tk.commands.base import Commands
 from tk.commands.batch import batch
+from tk.commands.calibrate import calibrate
 from tk.commands.config import config
 from tk.commands.demo import demo
 from tk.commands.doctor import doctor
@@ -14,10 +15,9 @@ from tk.commands.evaluate import evaluate
 from tk.commands.export import export
 from tk.commands.import_ import import_
 from tk.commands.inspect import inspect
-from tk.commands.level import level
 from tk.commands.masks import masks
+from tk.commands.moved import level, refine
 from tk.commands.reconstruct import reconstruct
-from tk.commands.refine import refine
 from tk.commands.render import render
 from tk.commands.report import report
 from tk.commands.track import track
@@ -31,7 +31,7 @@ def main() -> None:
 
 
 for _command in (
-    batch, config, demo, doctor, evaluate, export, import_, inspect, level, masks, reconstruct, refine, render, report,
-    track, view,
+    batch, calibrate, config, demo, doctor, evaluate, export, import_, inspect, level, masks, reconstruct, refine,
+    render, report, track, view,
 ):  # fmt: skip
     main.add_command(_command)

@@ -2,7 +2,7 @@
 
 tk runs cameras, processes and captures in parallel instead. A pool of threads splits a matrix product differently from
 one thread, so the last digits of a result would depend on the number of cores. Pools also wait for work by spinning:
-matrices and images are small, so `tk refine` takes 2.3 times the processor time with a pool, and drawing 1.9 times.
+matrices and images are small, so a refinement takes 2.3 times the processor time with a pool, and drawing 1.9 times.
 """
 
 from __future__ import annotations

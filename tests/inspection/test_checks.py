@@ -1,4 +1,4 @@
-"""`tk inspect` and `tk level` on the tiny capture, and on damaged copies."""
+"""`tk inspect` and `tk calibrate --level` on the tiny capture, and on damaged copies."""
 
 from __future__ import annotations
 
@@ -224,9 +224,9 @@ def test_level_writes_up_and_keeps_the_rest(tk: Tk, copy: Path) -> None:
     text = f"# mine\nfps = 15.0  # as it was\n[volume]\ncenter = {center}\nsize = [3.2, 3.2, 3.2]\n"
     (copy / "capture.toml").write_text(text)
     inferred = open_capture(copy)
-    assert any("gives no up" in warning and "tk level" in warning for warning in inferred.warnings)
+    assert any("gives no up" in warning and "--level" in warning for warning in inferred.warnings)
     assert np.degrees(np.arccos(inferred.up_axis @ R[:, 2])) < 6
-    ran = tk("level", copy)
+    ran = tk("calibrate", copy, "--level")
     assert ran.code == 0 and ran.out.startswith("up = "), ran.err
     opened = open_capture(copy)
     assert not any("up" in warning for warning in opened.warnings)
@@ -234,7 +234,7 @@ def test_level_writes_up_and_keeps_the_rest(tk: Tk, copy: Path) -> None:
     written = (copy / "capture.toml").read_text()
     assert written.startswith("up = [") and written.endswith(text)
     shutil.rmtree(copy / "videos")
-    tk("level", copy).complaint("videos")
+    tk("calibrate", copy, "--level").complaint("videos")
 
 
 @pytest.mark.parametrize(

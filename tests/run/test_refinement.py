@@ -1,4 +1,4 @@
-"""`tk refine` and what `tk track` does by itself: a rendered capture whose cameras are off, a video that is late."""
+"""`tk calibrate --refine` and what `tk track` does by itself: cameras that are off, a video that is late."""
 
 from __future__ import annotations
 
@@ -94,13 +94,13 @@ def test_refine_writes_a_calibration(
 ) -> None:
     path, _ = run
     output = tmp_path / "refined.toml"
-    ran = tk("refine", turned, path, "-o", output, "--trust", "4")
+    ran = tk("calibrate", turned, "--refine", path, "-o", output, "--trust", "4")
     assert ran.code == 0 and "cam2" in ran.out and "±" in ran.out, ran.err
     true, given = open_capture(tiny).rig, open_capture(turned).rig
     refined = read_calibration(output)
     assert turns(refined.rig, true).max() < 0.75 * turns(given, true).max()
     assert len(refined.time_offset_s) == len(given)
-    tk("refine", turned, path, "-o", output).complaint(str(output), "--force")
+    tk("calibrate", turned, "--refine", path, "-o", output).complaint(str(output), "--force")
 
 
 def test_reduced_images_refine_the_recorded_cameras(run: tuple[Path, Silent], turned: Path, tmp_path: Path) -> None:
@@ -186,8 +186,8 @@ def test_result_without_a_body_and_bad_options_are_refused(tiny: Path, tracked: 
     shutil.copy(tracked, bare)
     with h5py.File(bare, "r+") as file:
         del file["model"]
-    tk("refine", tiny, bare, "-o", output).complaint(str(bare), "no body with contours")
-    tk("refine", tiny, tracked, "-o", output, "--trust", "0").complaint("trust = 0")
+    tk("calibrate", tiny, "--refine", bare, "-o", output).complaint(str(bare), "no body with contours")
+    tk("calibrate", tiny, "--refine", tracked, "-o", output, "--trust", "0").complaint("trust = 0")
     assert not output.exists()
 
 

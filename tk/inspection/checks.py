@@ -488,6 +488,6 @@ def _findings(found: Inspection, capture: Capture, agreement: Agreement) -> list
     if tilt > _TILTED_DEG:
         lines.append(
             f"up = {shown(capture.up)} differs by {tilt:.0f}° from the estimate from cameras and person, "
-            f"{shown(found.leveling.up)}: tk level writes the estimate to capture.toml"
+            f"{shown(found.leveling.up)}: tk calibrate --level writes the estimate to capture.toml"
         )
     return lines

@@ -1,4 +1,4 @@
-"""`tk refine`: a calibration refined by a tracked recording of a person."""
+"""`tk calibrate --refine`: a calibration refined by a tracked recording of a person."""
 
 from __future__ import annotations
 

@@ -406,7 +406,10 @@ def _up(settings: CaptureSettings, found: FoundUp, path: Path, warn: Callable[[s
         return found.up
     if up_vector(found.up) @ up_vector(DEFAULT_UP) > np.cos(np.radians(_UP_DEG)):
         return DEFAULT_UP
-    warn(f"{path / 'capture.toml'}: gives no up; {shown(found.up)} is taken, {found.how}; tk level looks closer")
+    warn(
+        f"{path / 'capture.toml'}: gives no up; {shown(found.up)} is taken, {found.how}; "
+        "tk calibrate --level looks closer"
+    )
     return found.up
 
 

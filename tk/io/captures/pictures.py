@@ -37,7 +37,7 @@ def probe_pictures(path: Path, is_mask: bool = False) -> PictureClip:
         VideoError: no pictures, a gap in the numbers, a number used twice, or the first cannot be decoded.
     """
     files = _numbered_pictures(path) if path.is_dir() else (path,)
-    height, width = _read_picture(files[0], is_mask).shape[:2]
+    height, width = read_picture(files[0], is_mask).shape[:2]
     return PictureClip(path, width, height, len(files), is_mask, files=files)
 
 
@@ -60,7 +60,7 @@ class _PictureReader:
         if self._index >= len(clip.files):
             raise VideoError(f"{clip.path}: has no picture number {self._index}; it holds {len(clip.files)}")
         path = clip.files[self._index]
-        picture = _read_picture(path, clip.is_mask)
+        picture = read_picture(path, clip.is_mask)
         self._index += 1
         deliver(clip, picture, path, out)
 
@@ -92,7 +92,7 @@ def _numbered_pictures(folder: Path) -> tuple[Path, ...]:
     return tuple(files[number] for number in numbers)
 
 
-def _read_picture(path: Path, is_mask: bool) -> NDArray[Any]:
+def read_picture(path: Path, is_mask: bool) -> NDArray[Any]:
     if not path.is_file():
         raise VideoError(f"{path}: there is no such file")
     coded = path.read_bytes()

@@ -42,7 +42,7 @@ SCALES, COARSE_ROUNDS, ROUNDS = 2, 2, 8
 
 @dataclass(frozen=True)
 class RefinementSettings:
-    """What `tk refine` may change."""
+    """What `tk calibrate --refine` may change."""
 
     focal: bool = False  # whether focal lengths change, too
     offsets: bool = True  # whether the videos' delays are estimated

@@ -1,4 +1,4 @@
-"""`tk refine`."""
+"""`tk calibrate CAPTURE --refine`."""
 
 from __future__ import annotations
 
@@ -17,21 +17,6 @@ if TYPE_CHECKING:
 _UNKNOWN_FRAMES = 0.25
 
 
-@click.command(epilog=base.example("tk refine CAPTURE result.h5 -o refined.toml"))
-@base.capture_argument
-@base.result_argument
-@click.option("-o", "--output", required=True, type=base.PATH, metavar="CALIBRATION.toml")
-@click.option("--focal", is_flag=True, help="Also refine the focal lengths.")
-@click.option("--offsets/--no-offsets", default=True, show_default=True, help="Estimate the videos' time offsets.")
-@click.option(
-    "--trust", type=float, default=1.0, show_default=True,
-    help="Expected error of the calibration; 1 means about 0.3° and 12 mm.",
-)  # fmt: skip
-@base.cameras_option
-@base.masks_option
-@base.config_option
-@base.force_option
-@base.quiet_option
 def refine(
     capture: Path,
     result: Path,
@@ -45,7 +30,7 @@ def refine(
     force: bool,
     quiet: bool,
 ) -> None:
-    """Refine the calibration and the time offsets of CAPTURE with RESULT.h5, a result tracked from CAPTURE."""
+    """Refine the calibration and the time offsets of a capture with a result that was tracked from it."""
     with ConsoleReporter(quiet, stage="loading") as reporter:
         from tk.io.importers import open_recording
         from tk.io.results.reader import read_result

@@ -1,0 +1,165 @@
+"""Whole calibrations from points: truth is found, and each fault is refused or judged with the camera's name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scripts.board_rigs import compare
+from scripts.synthetic.boards import make_rig, place_boards, true_world
+from tests.calibration.rigs import BOARD, POSES, QUICK, RECIPE, RIG, footages, keep, see
+from tk.calibration.boards import make_board
+from tk.calibration.footage import Footage
+from tk.calibration.poses import Pose, exp
+from tk.calibration.rig import Calibrated, Options, calibrate, rig_of
+from tk.calibration.verdict import Verdict, judge
+from tk.calibration.world import place_world
+from tk.errors import CalibrationError, ConfigError
+
+
+def run(recorded: list[Footage], options: Options = QUICK) -> tuple[Calibrated, Verdict]:
+    done = calibrate(recorded, BOARD, options, lambda _: None)
+    return done, judge(done)
+
+
+@pytest.fixture(scope="module")
+def good() -> tuple[Calibrated, Verdict]:
+    return run(footages())
+
+
+def test_true_cameras_are_found_and_called_good(good: tuple[Calibrated, Verdict]) -> None:
+    done, verdict = good
+    errors = compare(done.rig, true_world(RIG, RECIPE, BOARD))
+    assert errors.place_mm < 3 and errors.turn_deg < 0.1 and errors.focal_percent < 0.3
+    assert verdict.word == "good", verdict.reasons
+    assert errors.person_mm < 3 * 1000 * verdict.error_m  # the expected error is no promise, but near
+    assert done.world.floor == 0  # recognised
+    np.testing.assert_allclose(done.rig.centers, true_world(RIG, RECIPE, BOARD).centers, atol=0.02)
+
+
+def test_lens_is_chosen_by_held_out_views() -> None:
+    recipe = replace(RECIPE, cameras=((30, 3.2, 1.4, "action wide"), (85, 3.4, 2.0, "webcam")))
+    rig = make_rig(recipe)
+    poses = place_boards(recipe, rig, BOARD)
+    done, _ = run([see(camera, poses, c, noise_px=0.02) for c, camera in enumerate(rig)], Options())
+    assert [one.lens.model.name for one in done.fitted] == ["fisheye", "pinhole5"]
+
+
+def test_given_intrinsics_stay_and_are_scaled() -> None:
+    half = {camera.name: camera.reduced(2) for camera in RIG}
+    done, verdict = run(footages(), replace(QUICK, intrinsics=half))
+    for found, camera in zip(done.rig, RIG, strict=True):
+        np.testing.assert_allclose(found.matrix, camera.matrix, rtol=1e-9)
+    assert {one.how for one in verdict.cameras} == {"given"} and verdict.level == 0
+
+
+def test_similar_distances_hold_part_of_the_intrinsics() -> None:
+    recorded = footages()
+    far = [i for i in recorded[1].seen if 0 < i < 100]
+    recorded[1] = keep(recorded[1], *far)
+    _, verdict = run(recorded)
+    one = verdict.cameras[1]
+    assert one.how == "held" and {"p1", "p2", "k3", "cx", "cy"} <= set(one.by_prior)
+    assert verdict.word != "good" and any(
+        "camera cam2" in text and "factor of 2" in text for _, text in verdict.reasons
+    )
+
+
+def test_camera_without_shared_instants_is_named() -> None:
+    recorded = footages()
+    recorded[2] = keep(recorded[2], *range(140, 160))
+    with pytest.raises(CalibrationError, match="camera cam3: connected to nobody: it sees the board in 6 images"):
+        run(recorded)
+
+
+def test_camera_with_two_views_is_named() -> None:
+    recorded = footages()
+    recorded[0] = keep(recorded[0], 100, 101)
+    with pytest.raises(
+        CalibrationError, match="camera cam1: too few views: the board charuco 7x5 of 4x4_50 is in 2 of"
+    ):
+        run(recorded)
+
+
+def test_video_of_other_instants_is_refused() -> None:
+    recorded = footages()
+    shared = [i for i in POSES if i < 100]
+    late = {i: POSES[shared[k - 5]] if i in shared else POSES[i] for k, i in enumerate(POSES)}
+    recorded[1] = see(RIG[1], late, 1)
+    with pytest.raises(CalibrationError, match="camera cam2: contradicts"):
+        run(recorded)
+
+
+def test_camera_that_was_moved_is_named() -> None:
+    own = Pose(RIG[1].rotation, RIG[1].translation)
+    turn = own.inverse() @ Pose(exp(np.radians([0.0, 2.0, 0.0])), np.zeros(3)) @ own
+    recorded = footages()
+    recorded[1] = see(RIG[1], {i: turn @ pose if 9 <= i < 100 else pose for i, pose in POSES.items()}, 1)
+    _, verdict = run(recorded)
+    assert verdict.word != "good"
+    blamed = [text for _, text in verdict.reasons if "contradict" in text]
+    assert blamed and all(text.startswith("camera cam2") for text in blamed), verdict.reasons
+
+
+def test_mirrored_camera_is_refused() -> None:
+    """A chessboard looks alike in a mirror, so that only other cameras show it; a ChArUco board is not even found."""
+    recorded = footages()
+    for seen in recorded[1].seen.values():
+        seen.detection.pixels[:, 0] = RIG[1].width - 1 - seen.detection.pixels[:, 0]
+    with pytest.raises(CalibrationError, match="camera cam2"):
+        run(recorded)
+
+
+def test_noise_lowers_the_verdict() -> None:
+    _, verdict = run(footages(noise_px=0.7))
+    assert verdict.word == "usable" and any("px off" in text for _, text in verdict.reasons)
+
+
+def test_floor_can_be_named_and_is_checked(good: tuple[Calibrated, Verdict]) -> None:
+    state = good[0].solved.state
+    named = rig_of(place_world(state, BOARD, 0).state, good[0].footages)
+    np.testing.assert_allclose(named.centers, good[0].rig.centers)
+    with pytest.raises(CalibrationError, match="--floor 77: no camera finds a sharp board at this instant"):
+        place_world(state, BOARD, 77)
+    with pytest.raises(CalibrationError, match=r"--floor 5: .* below this board"):
+        place_world(state, BOARD, 5)
+
+
+def test_without_a_board_on_the_floor_the_cameras_give_up(good: tuple[Calibrated, Verdict]) -> None:
+    state = good[0].solved.state
+    world = place_world(replace(state, boards={i: pose for i, pose in state.boards.items() if i}), BOARD, None)
+    assert world.floor is None and "no board lies on the floor" in world.how
+    up = world.state.cameras[0].rotation @ np.array([0.0, 0, 1])
+    assert np.degrees(np.arccos(up @ RIG[0].rotation @ np.array([0.0, 0, 1]))) < 3
+
+
+def test_one_camera_has_intrinsics_only() -> None:
+    done, verdict = run(footages()[:1])
+    assert abs(done.rig[0].matrix[0, 0] / RIG[0].matrix[0, 0] - 1) < 0.003
+    assert verdict.pairs == () and np.isnan(verdict.error_m) and verdict.to_dict()["error_mm"] is None
+
+
+def test_intrinsics_of_another_shape_are_refused() -> None:
+    cut = {camera.name: replace(camera, height=400) for camera in RIG}
+    with pytest.raises(CalibrationError, match="camera cam1 has images of 800×400"):
+        run(footages(), replace(QUICK, intrinsics=cut))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (("charuco", None, 200.0), "a square of 200 m; give its side in metres: --square 0.2 if it is in mm"),
+        (("charuco", None, 0.0), "--square 0"),
+        (("charuco", "7by5", 0.1), "--size 7by5"),
+        (("chessboard", "9x7", 0.1), "looks the same after half a turn"),
+        (("charuco", "30x30", 0.1), "--dictionary 4x4_50: has 50 markers"),
+        (("charuco", None, 0.1, 75.0), "--marker 75"),
+        (("charuco", None, 0.1, None, "7x9_50"), "--dictionary 7x9_50"),
+    ],
+)
+def test_impossible_boards_are_refused(arguments: tuple[str, str | None, float], part: str) -> None:
+    with pytest.raises(ConfigError, match=r".") as caught:
+        make_board(*arguments)
+    assert part in caught.value.line

@@ -1,0 +1,1 @@
+"""Calibrate cameras with a printed board: `tk calibrate BOARDS`."""
