@@ -3,10 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.body.body_points import SEGMENT, places
+from tk.model.body.body_points import LANDMARKS, SEGMENT, places
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.camera import Rig
-from tk.model.cues.landmarks import LANDMARKS
 
 Float = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from tests.model.landmarks import landmarks_of
 from tests.run.test_source import BODY, ONE, POSES, RIG, SETUP, task
 from tk.io.captures.frames import FrameSet
 from tk.io.results.reader import read_result
-from tk.model.cues.landmarks import LANDMARKS
+from tk.model.body.body_points import LANDMARKS
 from tk.run.learned_masks import LEARNED, SEGMENTER
 from tk.run.segmentation import Labels
 from tk.run.session import track_task

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from tests.model.ring import ring_of_cameras
 from tests.people import VOLUME, person_mask
 from tk.errors import ConfigError
+from tk.model.body.body_points import LANDMARKS
 from tk.model.cameras.triangulation import triangulate_joints
 from tk.model.cameras.volume import Volume
-from tk.model.cues.landmarks import LANDMARKS
 from tk.model.masks.sightings import Sighting
 from tk.segmenters.people_masks import PeopleMasks
 

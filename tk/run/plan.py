@@ -18,8 +18,8 @@ from tk.io.captures.source import Source
 from tk.io.results.data import JointAngles, ResultMeta
 from tk.io.settings_file import to_toml
 from tk.model.body.anthropometry import AVERAGE_BODY
+from tk.model.body.body_points import LANDMARKS
 from tk.model.body.skeleton import SEGMENTS, build_skeleton
-from tk.model.cues.landmarks import LANDMARKS
 from tk.model.setup import Setup, Subject
 from tk.run.prefetch import TIMING_STAGES, Observations, open_observations
 from tk.run.segmentation import mask_source, sees_landmarks, sources_of_masks

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
-from tk.model.cues.landmarks import JOINT_LANDMARKS, LANDMARKS
+from tk.model.body.body_points import JOINT_LANDMARKS, LANDMARKS
 
 if TYPE_CHECKING:
     from tk.model.masks.sightings import Sighting
@@ -51,8 +51,8 @@ class Finder(Protocol):
 class PoseSegmenter(Protocol):
     """A segmenter that also sees where points of the person's body are.
 
-    Its attribute ``landmarks`` names them, see :data:`tk.model.cues.landmarks.LANDMARKS`; without it, they are
-    :data:`tk.model.cues.landmarks.JOINT_LANDMARKS`.
+    Its attribute ``landmarks`` names them, see :data:`tk.model.body.body_points.LANDMARKS`; without it, they are
+    :data:`tk.model.body.body_points.JOINT_LANDMARKS`.
     """
 
     def segment_pose(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
@@ -94,7 +94,7 @@ def segmented(
     segmenter: Segmenter, name: str, image: NDArray[np.uint8]
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     """Return the checked result of a segmenter for an image: the probabilities (h, w), and the landmarks (L, 3) in the
-    order of :data:`~tk.model.cues.landmarks.LANDMARKS`, NaN where the segmenter has none.
+    order of :data:`~tk.model.body.body_points.LANDMARKS`, NaN where the segmenter has none.
 
     Raises:
         ConfigError: the result is not a probability for each pixel, or not one row of three numbers for each landmark.

@@ -30,10 +30,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.model.body.body_points import LANDMARKS
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.landmark_agreement import associated
 from tk.model.cameras.volume import Volume
-from tk.model.cues.landmarks import LANDMARKS
 from tk.model.hull.coarse import CoarseHull
 from tk.model.masks.sightings import Patch, SeenPerson, Sighting, locate, volume_patch
 from tk.segmenters import Finder, Segmenter, segmented
@@ -89,7 +89,7 @@ class Segmented(NamedTuple):
         masks: (C, H, W) uint8, 0 or 255.
         uncertain: (C, H, W) bool, where the mask is 0.
         landmarks: (N, C, L, 3) x, y, pixels, and visibility of each of N people's landmarks in each image, see
-            :data:`~tk.model.cues.landmarks.LANDMARKS`; NaN where an image shows none.
+            :data:`~tk.model.body.body_points.LANDMARKS`; NaN where an image shows none.
     """
 
     masks: Images

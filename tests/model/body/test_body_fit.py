@@ -16,10 +16,10 @@ from tk.model.body import body_fit
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_fit import fit_body
 from tk.model.body.body_parameters import BodyFamily, shape_rows
+from tk.model.body.body_points import LANDMARKS
 from tk.model.body.cone_body import SHAPE_NUMBERS, build_cone_body
 from tk.model.body.gait_poses import standing_pose, walking_pose
 from tk.model.body.skeleton import SEGMENTS
-from tk.model.cues.landmarks import LANDMARKS
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Views
 

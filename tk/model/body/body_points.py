@@ -82,6 +82,15 @@ def _table() -> dict[str, BodyPoint]:
 
 #: the points by name
 POINTS = _table()
+#: names of the landmarks, in the order of all arrays of landmarks
+LANDMARKS = tuple(POINTS)
+#: landmarks of a segmenter that does not name them: shoulders, elbows, wrists, hips, knees, ankles
+JOINT_LANDMARKS = tuple(
+    name
+    for kind in ("arm", "leg")
+    for pair in zip(LIMBS[f"{kind}_l"], LIMBS[f"{kind}_r"], strict=True)
+    for name in pair
+)
 #: (L,) index of the segment that carries each point
 SEGMENT = np.array([SEGMENTS.index(point.segment) for point in POINTS.values()], np.int32)
 

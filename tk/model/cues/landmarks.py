@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.mask_values import PERSON
-from tk.model.body.body_points import POINTS, SEGMENT, places
+from tk.model.body.body_points import JOINT_LANDMARKS, LANDMARKS, POINTS, SEGMENT, places
 from tk.model.body.cone_body import ConeBody
 from tk.model.body.initial_pose import pose_of_joints
-from tk.model.body.joints import HIPS, JOINTS, LIMBS, SHOULDERS, side_of
+from tk.model.body.joints import HIPS, JOINTS, SHOULDERS, side_of
 from tk.model.body.skeleton import Skeleton
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.triangulation import triangulate_joints
@@ -30,16 +30,6 @@ from tk.model.setup import AVERAGE_STATURE_M
 from tk.optim.quadratic import Quadratic
 
 Float = NDArray[np.float64]
-
-#: names of the landmarks
-LANDMARKS = tuple(POINTS)
-#: those that a segmenter returns that names none: shoulders, elbows, wrists, hips, knees, ankles
-JOINT_LANDMARKS = tuple(
-    name
-    for kind in ("arm", "leg")
-    for pair in zip(LIMBS[f"{kind}_l"], LIMBS[f"{kind}_r"], strict=True)
-    for name in pair
-)
 
 # Standard deviation of a landmark in an image, metres along each axis at the person's distance, for a person of average
 # stature: SEEN_M with visibility 1, HIDDEN times as much with visibility 0; and the share of landmarks that are right.
