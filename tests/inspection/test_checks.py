@@ -18,7 +18,7 @@ from tests.io.conftest import write_picture, write_video
 from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tk.errors import CaptureError
-from tk.inspection.checks import best_shift
+from tk.inspection.delays import best_shift
 from tk.inspection.leveling import Leveling, find_up, write_up
 from tk.io.captures.capture import open_capture
 from tk.model.body import gait_poses as gait

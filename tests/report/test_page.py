@@ -192,7 +192,7 @@ def test_images_show_lost_worst_and_typical_frames(complete: Path, tracked: Path
 def test_report_writes_a_page(tk: Tk, complete: Path, tiny: Path, tmp_path: Path) -> None:
     target = tmp_path / "page.html"
     ran = tk("report", complete, tiny, "-o", target)
-    assert (ran.code, ran.err) == (0, f"wrote {target}\n") and made_here(target)
+    assert ran.code == 0 and ran.err.endswith(f"wrote {target}\n") and made_here(target)  # after progress, if slow
     data = data_of(target.read_text(encoding="utf-8"))
     assert {picture["row"] for picture in data["pictures"]} >= {LOST[0], 11}
     assert len(data["scene"]["cameras"]) == 4

@@ -10,16 +10,16 @@ of these pixels.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.evaluation.joints import plain_values
-from tk.inspection.leveling import Leveling, find_up
-from tk.inspection.people import PeopleWatch, PersonReport, many_people
+from tk.inspection.delays import REACH, find_delays, in_frames
+from tk.inspection.leveling import find_up
+from tk.inspection.people import PeopleWatch, many_people
+from tk.inspection.results import CameraReport, Inspection, Sample
 from tk.io.captures.capture import Capture
 from tk.io.captures.video import odd_turn
 from tk.kernels.mask_values import PERSON
@@ -43,134 +43,17 @@ Masks = NDArray[np.uint8]
 # These values decide which findings are printed, and no tracking result depends on them. With half and twice each value
 # the findings on walk, fold, rig9, pair and treadmill-slow are the same, except for specks in the ragged masks of
 # treadmill-slow (half the value names two cameras more, twice the value one fewer).
-#: largest shift of a video that is compared, frames; at the edge it is no optimum
-_REACH = 6
-#: frames that are compared; frames whose neighbours, _REACH before and after, are also compared
+#: frames that are compared; frames whose neighbours, REACH before and after, are also compared
 _FRAMES, _DELAY_FRAMES = 10, 5
 #: frames that are read, from the first one that all cameras have: videos are decoded in order, so later frames take
 #: longer
 _SPAN = 600
-#: a video is delayed if shifting it reduces the share of its masks outside the hull to less than this share of itself,
-#: and that share without a shift is larger than the second value
-_DELAY_GAIN, _DELAY_LEAST = 0.5, 0.01
 #: findings, shares of a mask's area: parts that are not connected to the largest one; holes
 _SPECKS, _HOLES = 0.05, 0.01
 #: finding: a larger share of the hull at the border of the working volume
 _AT_BORDER = 0.03
 #: finding: a larger angle between the capture's up and the estimated one, degrees
 _TILTED_DEG = 10.0
-
-
-@dataclass(frozen=True)
-class CameraReport:
-    """One camera.
-
-    Attributes:
-        area: share of the image that its masks cover. specks, holes: shares of the mask, see :data:`_SPECKS`.
-        empty, cut: shares of the frames without a person, and with a person at the edge of the image.
-        outside: share of its masks outside the hull of the other cameras.
-        shift_px: smallest shift that moves its masks into that hull, pixels; NaN if none does.
-        pairs_px: error of its outlines in pairs with the others that are not wrong, median, pixels; NaN if no pair can
-            be tested.
-        late_frames: frames by which its video starts late: its frame k shows what frame k + late of the others shows.
-        bad_images: number of frames whose image is blank, frozen or moved.
-        verdict: what is wrong, in words; empty if nothing is.
-    """
-
-    name: str
-    area: float
-    specks: float
-    holes: float
-    empty: float
-    cut: float
-    outside: float
-    shift_px: float
-    pairs_px: float
-    late_frames: int
-    bad_images: int
-    verdict: str
-
-
-@dataclass(frozen=True)
-class Inspection:
-    """The results of all checks.
-
-    Attributes:
-        capture: name of the capture. frames: frames that were checked.
-        cameras: one report per camera.
-        with_hull: share of the frames in which the masks have a visual hull in common.
-        extent_m: length of the person, metres.
-        seen_by_all, seen_by_two: shares of the working volume that all cameras, or at least two, see.
-        at_border: share of the hull at the border of the working volume.
-        leveling: up direction and floor.
-        people: those who were found, by number.
-        findings: problems, one line each, the worst first.
-        notes: what the capture and the segmentation report, one line each.
-    """
-
-    capture: str
-    frames: tuple[int, ...]
-    cameras: tuple[CameraReport, ...]
-    with_hull: float
-    extent_m: float
-    seen_by_all: float
-    seen_by_two: float
-    at_border: float
-    leveling: Leveling
-    people: tuple[PersonReport, ...]
-    findings: tuple[str, ...]
-    notes: tuple[str, ...] = ()
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the values for JSON, NaN as None."""
-        return dict(plain_values(asdict(self)))
-
-    def format_table(self) -> str:
-        """Return the text for the terminal."""
-        lines = [
-            f"{self.capture}: {len(self.frames)} frames from {self.frames[0]} to {self.frames[-1]}; "
-            f"{self.with_hull:.0%} of them have a visual hull; length of the person {self.extent_m:.2f} m",
-            "",
-            f"{'camera':12} {'mask':>6} {'specks':>7} {'holes':>6} {'empty':>6} {'cut':>5} {'outside':>8} "
-            f"{'shift':>7} {'pairs':>7} {'late':>5}",
-        ]
-        for c in self.cameras:
-            shift, pairs = (f"{px:.0f} px" if np.isfinite(px) else "?" for px in (c.shift_px, c.pairs_px))
-            outside = f"{c.outside:.1%}" if np.isfinite(c.outside) else "-"
-            lines.append(
-                f"{c.name:12} {c.area:6.1%} {c.specks:7.1%} {c.holes:6.1%} {c.empty:6.0%} {c.cut:5.0%} {outside:>8} "
-                f"{shift:>7} {pairs:>7} {c.late_frames:5d}"
-            )
-        lines += [
-            "",
-            f"volume: all cameras see {self.seen_by_all:.0%} of it, at least two see {self.seen_by_two:.0%}; "
-            f"{self.at_border:.1%} of the person is at its border",
-            f"up: {shown(self.leveling.up)}, {self.leveling.how}",
-            f"floor: {self.leveling.floor_m:+.2f} m along up"
-            if np.isfinite(self.leveling.floor_m)
-            else "floor: not found",
-            *(person.line(len(self.cameras)) for person in self.people),
-            "",
-            *(self.findings or ("No problems found.",)),
-            *(f"note: {note}" for note in self.notes),
-        ]
-        return "\n".join(lines)
-
-
-@dataclass(frozen=True)
-class Sample:
-    """What the sheet of `tk inspect` shows of a frame.
-
-    Attributes:
-        index: frame index. images: (C, H, W, 3) uint8. masks: (C, H, W) uint8.
-        hulls: (C, h, w) bool, silhouettes of the hull of the other cameras, every ``step``-th pixel; None without one.
-    """
-
-    index: int
-    images: NDArray[np.uint8]
-    masks: Masks
-    hulls: NDArray[np.bool_] | None
-    step: int
 
 
 @one_thread()
@@ -189,20 +72,20 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
     span = range(first, min(capture.frame_count, first + _SPAN))
     frames = np.unique(np.linspace(first, span[-1], _FRAMES).round().astype(int))
     quarter = first + len(span) // 4
-    last = max(span[-1] - _REACH, quarter)
+    last = max(span[-1] - REACH, quarter)
     centers = np.unique(np.linspace(quarter, last, _DELAY_FRAMES).round().astype(int)).tolist()
-    near = {i + s for i in centers for s in range(-_REACH, _REACH + 1)} & set(span)
+    near = {i + s for i in centers for s in range(-REACH, REACH + 1)} & set(span)
     kept = frames[np.linspace(0, len(frames) - 1, min(pictures, len(frames))).round().astype(int)]
     read = _read(capture, config, span, near | set(frames.tolist()), set(kept.tolist()))
     notes, small, masks = read.notes, read.small, read.masks
-    pairs = [(i + s, i + s + _REACH) for i in centers for s in (-_REACH, 0)]
+    pairs = [(i + s, i + s + REACH) for i in centers for s in (-REACH, 0)]
     given = [(small[i], small[k]) for i, k in pairs if capture.has_masks and i in small and k in small]
     unrelated = contradiction(given)
     compare = MaskAgreement(capture.rig, capture.volume)
     people, entered = read.watch.people(), read.watch.entered or 0
     if (later := frames >= entered).any():  # before it the masks show nobody, or people outside the volume
         kept, frames = kept[kept >= entered], frames[later]
-        centers = [i for i in centers if i - _REACH >= entered] or centers
+        centers = [i for i in centers if i - REACH >= entered] or centers
     agreement = compare.compare([masks[i] for i in frames.tolist()])
     if len(people) > 1:
         own = {index: read.watch.of_first(index, m) for index, m in masks.items()}
@@ -210,10 +93,10 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
         if not (alone.refusal or alone.wrong or alone.disagreement > INCONSISTENT):
             # the others are people, not what a turned camera shows of one person
             masks, agreement = own, alone
-    late, sure = _delays(compare, masks, centers, agreement)
+    late, sure = find_delays(compare, masks, centers, agreement)
     for c in () if sure else np.flatnonzero(late).tolist():
         notes.append(
-            f"camera {capture.rig[c].name} may start {_frames(late[c])}, but without some of the compared frames its "
+            f"camera {capture.rig[c].name} may start {in_frames(late[c])}, but without some of the compared frames its "
             "masks say otherwise: it cannot be decided"
         )
         late[c] = 0
@@ -304,81 +187,6 @@ def _at_border(volume: Volume, points: Sequence[NDArray[np.float64]]) -> float:
     return float(at_border.mean()) if len(p) else float("nan")
 
 
-def _delays(
-    compare: MaskAgreement, masks: dict[int, Masks], centers: Sequence[int], agreement: Agreement
-) -> tuple[NDArray[np.int64], bool]:
-    """Return the delay of each camera (C,) frames, the shift with which its masks lie in the hull of the others; and
-    whether it is certain, see :func:`best_shift`."""
-    C = len(compare.rig)
-    small = {index: compare.small(m) for index, m in masks.items()}
-    hulls = compare.hulls([compare.possible(masks[i]) for i in centers])
-    shifts = np.arange(-_REACH, _REACH + 1)
-    late = np.zeros(C, np.int64)
-    found = [
-        best_shift(*_areas_by_shift(small, centers, hulls, [k for k in agreement.right if k != c], c, shifts))
-        for c in range(C)
-    ]
-    # a delayed camera also spoils the hulls for the others, which then gain from a shift, too; only the shift of the
-    # delayed one makes all cameras agree
-    candidates = [c for c, (shift, *_) in enumerate(found) if shift]
-    if not candidates:
-        return late, True
-
-    def outside(c: int) -> float:
-        pairs = [(masks[i], masks[i + found[c][0]]) for i in centers if i + found[c][0] in masks]
-        this = np.arange(C)[:, None, None] == c
-        return compare.mean_outside([np.where(this, shifted, now) for now, shifted in pairs], agreement.right)
-
-    c = min(candidates, key=outside)
-    late[c] = -found[c][0]
-    return late, found[c][2]
-
-
-def best_shift(outside: NDArray[np.float64], area: NDArray[np.float64]) -> tuple[int, float, bool]:
-    """Return the shift that moves a camera's masks into the hull of the others, frames; by how much the share outside
-    falls; and whether it is the same, to a frame, and not 0, without any one of the frames (jackknife). 0, 0.0 if none
-    does: a shift at the edge of the range is no optimum.
-
-    Args:
-        outside, area: (N, S) area outside the hull and whole area, of N frames and shifts from -S // 2 to S // 2.
-    """
-    total = np.array([outside, area])
-    result = _lowest(*total.sum(axis=1))
-    rest = [_lowest(*np.delete(total, k, axis=1).sum(axis=1))[0] for k in range(len(area))]
-    return *result, all(abs(shift - result[0]) <= 1 and np.sign(shift) == np.sign(result[0]) for shift in rest)
-
-
-def _lowest(outside: NDArray[np.float64], area: NDArray[np.float64]) -> tuple[int, float]:
-    share = np.where(area > 0, outside / np.maximum(area, 1), np.inf)
-    best, middle = int(np.argmin(share)), len(share) // 2
-    now, least = float(share[middle]), float(share[best])
-    inside = 0 < best < len(share) - 1
-    mended = _DELAY_LEAST < now < np.inf and least < _DELAY_GAIN * now
-    return (best - middle, now - least) if inside and mended else (0, 0.0)
-
-
-def _areas_by_shift(
-    small: dict[int, NDArray[np.bool_]],
-    centers: Sequence[int],
-    hulls: Sequence[Hull | None],
-    others: Sequence[int],
-    camera: int,
-    shifts: NDArray[np.int64],
-) -> NDArray[np.float64]:
-    """Return (2, N, S) the area of a camera's masks outside the others' hull and their whole area, in N frames, for
-    masks taken S shifts later."""
-    areas = np.zeros((2, len(centers), len(shifts)))
-    for n, (center, hull) in enumerate(zip(centers, hulls, strict=True)):
-        # all shifts or none, so that they are compared over the same frames
-        if hull is None or any(center + int(s) not in small for s in shifts):
-            continue
-        silhouette = hull.silhouette(hull.carve(others), camera)
-        for i, s in enumerate(shifts):
-            mask = small[center + int(s)][camera]
-            areas[:, n, i] = np.count_nonzero(mask & ~silhouette), mask.sum()
-    return areas
-
-
 def _silhouettes(hull: Hull | None, good: Sequence[int]) -> NDArray[np.bool_] | None:
     if hull is None:
         return None
@@ -409,7 +217,7 @@ def _camera(
         verdict = f"it {reason} (frame {first} is the first of {len(bad_images)})"
     elif late:
         verdict = (
-            f"its video seems to start {_frames(late)}: its frame {max(-late, 0)} shows what frame "
+            f"its video seems to start {in_frames(late)}: its frame {max(-late, 0)} shows what frame "
             f"{max(late, 0)} of the others shows"
         )
     elif c in agreement.wrong:
@@ -443,10 +251,6 @@ def _moved_since_empty(capture: Capture, images: NDArray[np.uint8], masks: Masks
                 "recording: record the empty scene again, and calibrate again if that was done before the move"
             )
     return lines
-
-
-def _frames(late: int) -> str:
-    return f"{abs(late)} frame{'s' if abs(late) > 1 else ''} {'late' if late > 0 else 'early'}"
 
 
 def _findings(found: Inspection, capture: Capture, agreement: Agreement) -> list[str]:

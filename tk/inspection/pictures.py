@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
-from tk.inspection.checks import Inspection, Sample
+from tk.inspection.results import Inspection, Sample
 from tk.io.captures.capture import Capture
 from tk.kernels.mask_values import PERSON
 from tk.model.cameras.camera import Camera

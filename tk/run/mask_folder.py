@@ -11,7 +11,8 @@ import tomli_w
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ConfigError, unwritable
-from tk.io.captures.capture import MASKS_RECORD, Capture
+from tk.io.captures.capture import Capture
+from tk.io.captures.clip_folder import MASKS_RECORD
 from tk.io.paths import check_not_input, replacing, resolved
 from tk.io.toml import load_toml
 from tk.run.plan import choose_frames

@@ -168,7 +168,7 @@ def test_panoptic(folder: Path, check: Import) -> None:
     write_clips(folder / "hdVideos", [f"hd_{name}" for name in names])
     checked = check(folder, rig, world=Y_DOWN)
     assert checked.capture.up == "-y" and checked.capture.rig.names == tuple(names)
-    checked.note('up = "-y": as CMU Panoptic defines it')
+    checked.note("up = -y: as CMU Panoptic defines it")
     checked.note("lengths are in cm, as the format says")
     checked.note("48 of its 52 cameras have no video here: left out")
 

@@ -56,7 +56,7 @@ def test_pose2sim(folder: Path, check: Import) -> None:
     assert checked.capture.rig.names[0] == "int_cam01_img"
     assert checked.capture.up == "z"
     checked.note("Calib_scene.toml", "lengths are in m")
-    checked.note('up = "z"', "the axis")
+    checked.note("up = z", "the axis")
     checked.note("hard links")
     text = (checked.imported.path / "capture.toml").read_text()
     assert "# imported from Pose2Sim, Calib_scene.toml" in text

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,18 +12,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import CalibrationError, CaptureError, VideoError, VolumeError
-from tk.io.captures.calibration import Calibration, match_camera, read_calibration
+from tk.errors import CalibrationError, CaptureError, VolumeError
+from tk.io.captures.calibration import Calibration, read_calibration
 from tk.io.captures.capture_toml import CaptureSettings, GivenSubject, read_settings
-from tk.io.captures.clip import Clip, Image
-from tk.io.captures.clip_folder import list_clips, names_in, probe
+from tk.io.captures.clip import Clip
+from tk.io.captures.clip_folder import clips_of, open_clips, open_masks, read_some
 from tk.io.captures.frames import FrameReader, FrameSet
-from tk.io.captures.pictures import PictureClip, picture_number
 from tk.io.captures.timing import check_clock, read_stamps
 from tk.io.captures.timing import resample as resampled
-from tk.io.captures.video import VideoClip, as_calibrated, damaged_images, notes_on, odd_turn
+from tk.io.captures.video import VideoClip, damaged_images, notes_on, odd_turn
 from tk.io.paths import text_of
-from tk.model.cameras.camera import Camera, Rig
+from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import all_look_away, infer_volume, sample_box, views_of
 from tk.model.cameras.mounting import DEFAULT_UP, FoundUp
 from tk.model.cameras.up import shown, up_vector
@@ -36,9 +34,6 @@ if TYPE_CHECKING:
     from tk.segmenters import Segmenter
 
 __all__ = ["Capture", "FrameReader", "FrameSet", "open_capture"]
-
-#: file in a folder of masks from `tk masks` that says how they were made
-MASKS_RECORD = "masks.toml"
 
 #: frame rate, 1/s, if neither `capture.toml` nor the videos give one; a note says so
 DEFAULT_FPS = 30.0
@@ -240,14 +235,14 @@ class Capture:
         folder = self.path / "background"
         if not folder.is_dir():
             return None
-        clips = _clips_of(self.calibration, folder, "background", "png", pictures=True)
+        clips = clips_of(self.calibration, folder, "background", "png", pictures=True)
         pixels = sum(camera.width * camera.height for camera in self.rig)
         recorded = sum(camera.width * camera.height * camera.reduction**2 for camera in self.rig)
         most = min(_BACKGROUND_FRAMES, max(_LEAST_BACKGROUND, _BACKGROUND_PIXELS // recorded))
         most = min(most, max(2, _BACKGROUND_BYTES // (3 * pixels)))
         small = [clip.reduced(camera.reduction) for clip, camera in zip(clips, self.rig, strict=True)]
         with ThreadPoolExecutor(os.cpu_count()) as threads:
-            return tuple(threads.map(lambda clip: _read_some(clip, most), small))
+            return tuple(threads.map(lambda clip: read_some(clip, most), small))
 
 
 def open_capture(
@@ -271,8 +266,8 @@ def open_capture(
     calibration = read_calibration(path / "calibration.toml").select(cameras)
     rig = calibration.rig
     settings = read_settings(path / "capture.toml")
-    clips = _open_clips(calibration, path)
-    mask_clips = _open_masks(calibration, path, masks)
+    clips = open_clips(calibration, path)
+    mask_clips = open_masks(calibration, path, masks)
     warnings: list[str] = [*calibration.notes, *notes_on(clips)]
     if settings.unknown:
         warnings.append(f"{path / 'capture.toml'}: unknown keys are ignored: {', '.join(settings.unknown)}")
@@ -315,66 +310,6 @@ def open_capture(
         calibration=calibration,
         time_offset_s=offsets,
     )
-
-
-def _open_clips(calibration: Calibration, path: Path) -> tuple[Clip, ...]:
-    for folder in (path / "videos", path / "images"):
-        if folder.is_dir():
-            return _clips_of(calibration, folder, "video" if folder.name == "videos" else "folder of pictures", "mp4")
-    raise VideoError(f"{path}: has neither videos/ nor images/")
-
-
-def _open_masks(calibration: Calibration, path: Path, masks: str) -> tuple[Clip, ...] | None:
-    if masks in ("none", "median"):
-        return None
-    folder = path / "masks" if masks == "auto" else Path(masks)
-    if not folder.is_dir():
-        if masks == "auto":
-            return None
-        raise CaptureError(f"masks {masks}: is not a folder; give auto, none, median or a folder of masks")
-    clips = _clips_of(calibration, folder, "masks", "mp4", is_mask=True)
-    if (folder / MASKS_RECORD).is_file():
-        for clip in clips:
-            if isinstance(clip, PictureClip) and picture_number(clip.files[0]) != 0:
-                raise CaptureError(
-                    f"{clip.path}: starts with {clip.files[0].name}, so frame 0 has no mask; "
-                    f"make the missing ones: tk masks {path} -o {folder}"
-                )
-    return clips
-
-
-def _clips_of(
-    calibration: Calibration, folder: Path, what: str, suffix: str, *, pictures: bool = False, is_mask: bool = False
-) -> tuple[Clip, ...]:
-    """Return each camera's clip in ``folder``, checked to be of the camera's size."""
-    found = list_clips(folder, pictures)
-    taken: dict[str, Camera] = {}
-    for camera, key in zip(calibration.rig, calibration.keys, strict=True):
-        try:
-            stem = match_camera(camera.name, key, found)
-        except CaptureError as ambiguous:
-            raise VideoError(f"{folder}: {ambiguous}") from None
-        if stem is None:
-            expected = folder / (camera.name if folder.name == "images" else f"{camera.name}.{suffix}")
-            raise VideoError(
-                f"{expected}: camera {camera.name!r} has no {what}; {folder.name}/ holds {names_in(folder)}"
-            )
-        if stem in taken:
-            raise VideoError(
-                f"{found[stem]}: fits both cameras {taken[stem].name!r} and {camera.name!r}; rename it to its camera"
-            )
-        taken[stem] = camera
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
-        clips = list(threads.map(lambda stem: probe(found[stem], is_mask), taken))
-    for k, (clip, camera) in enumerate(zip(clips, taken.values(), strict=True)):
-        size = camera.width, camera.height
-        clip = clips[k] = as_calibrated(clip, size)
-        if (clip.width, clip.height) != size:
-            raise VideoError(
-                f"{clip.path}: is {clip.width}×{clip.height}, but {calibration.path.name} gives camera {camera.name!r} "
-                f"{camera.width}×{camera.height}; calibrate for this size or scale the pictures"
-            )
-    return tuple(clips)
 
 
 def _common_length(clips: Sequence[Clip], late: Sequence[int], warn: Callable[[str], None]) -> int:
@@ -440,12 +375,3 @@ def _warn_of_units(calibration: Calibration, warn: Callable[[str], None]) -> Non
     centers = calibration.rig.centers
     if np.linalg.norm(np.ptp(centers, axis=0)) > _FAR_APART_M:
         warn(f'{calibration.path}: the cameras are over {_FAR_APART_M:g} m apart; is [metadata] units = "mm" missing?')
-
-
-def _read_some(clip: Clip, most: int) -> Image:
-    """Return the first frames of a clip, at most ``most``: (T, h, w, 3)."""
-    result = np.empty((min(clip.frame_count, most), clip.height, clip.width, 3), np.uint8)
-    with closing(clip.open()) as reader:
-        for out in result:
-            reader.read(out)
-    return result
