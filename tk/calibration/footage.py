@@ -45,7 +45,7 @@ class Seen:
 
     detection: Detection
     outline: Float  # (4, 2) pixels of the corners of the board
-    motion_px: float  # motion from this frame to the next; 0 for pictures
+    motion_px: float  # motion from this frame to the next; 0 for pictures and the last frame
     picture: bytes  # a small JPEG of the image
 
 
@@ -143,7 +143,7 @@ def _images(footage: Footage) -> Iterator[tuple[int, Grey, Grey | None]]:
                 raise CalibrationError(f"{footage.path}: {numbers[number].name} and {file.name} have the same number")
             numbers[number] = file
         for number, file in sorted(numbers.items()):
-            grey: Grey = read_picture(file, is_mask=True)
+            grey = _grey(read_picture(file, is_mask=False))
             height, width = grey.shape
             if footage.width and (width, height) != (footage.width, footage.height):
                 size = f"{footage.width}×{footage.height}"
@@ -156,19 +156,24 @@ def _images(footage: Footage) -> Iterator[tuple[int, Grey, Grey | None]]:
     step = max(1, -(-clip.frame_count // _LOOKS))
     reader, out = clip.open(), np.empty((clip.height, clip.width, 3), np.uint8)
     try:
-        at = 0
-        for instant in range(0, clip.frame_count - 1, step):
-            while at < instant:
+        waiting: tuple[int, Grey] | None = None  # for the frame that follows
+        for instant in range(clip.frame_count):
+            if instant % step > 1:
                 reader.skip()
-                at += 1
-            pair = []
-            for _ in range(2 if step > 1 else 1):
-                reader.read(out)
-                pair.append(np.asarray(cv2.cvtColor(out, cv2.COLOR_BGR2GRAY), np.uint8))
-                at += 1
-            yield instant, pair[0], pair[1] if len(pair) > 1 else None
+                continue
+            reader.read(out)
+            grey = _grey(out)
+            if waiting is not None:
+                yield *waiting, grey
+            waiting = (instant, grey) if instant % step == 0 else None
+        if waiting is not None:
+            yield *waiting, None
     finally:
         reader.close()
+
+
+def _grey(picture: NDArray[Any]) -> Grey:
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
 def _is_picture(file: Path) -> bool:

@@ -35,10 +35,10 @@ class Model:
 PINHOLE5 = Model("pinhole5", ("k1", "k2", "p1", "p2", "k3"), (0.5, 0.5, 0.005, 0.005, 0.3))
 PINHOLE8 = Model("pinhole8", (*PINHOLE5.names, "k4", "k5", "k6"), (*PINHOLE5.sigmas, 0.5, 0.3, 0.2))
 FISHEYE = Model("fisheye", ("k1", "k2", "k3", "k4"), (0.2, 0.2, 0.1, 0.1), fisheye=True)
-MODELS = {model.name: model for model in (PINHOLE5, PINHOLE8, FISHEYE)}
 
-#: models that the reader of `calibration.toml` takes; PINHOLE8 joins when it takes eight numbers
-WRITTEN = (PINHOLE5, FISHEYE)
+#: models to choose from, the one with fewer numbers first: a later one must fit clearly better
+CHOICE = (PINHOLE5, FISHEYE, PINHOLE8)
+MODELS = {model.name: model for model in CHOICE}
 
 #: standard deviations of the priors: logarithm of the focal length, of fx / fy, and principal point as a share of the
 #: image's width. Pixels are square in all common cameras; a principal point lies within 3 % of the centre, except in

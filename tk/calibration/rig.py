@@ -13,7 +13,7 @@ from tk.calibration.bundle import UNSYNCHRONISED, Lens, Solved, State, View, adj
 from tk.calibration.connect import Link, connect, find_links
 from tk.calibration.footage import FEWEST_SEEN, Footage, choose
 from tk.calibration.intrinsics import Fitted, board_poses, fit_lens
-from tk.calibration.lens import MODELS, WRITTEN
+from tk.calibration.lens import CHOICE, MODELS
 from tk.calibration.misses import explain_miss
 from tk.calibration.world import World, place_world
 from tk.errors import CalibrationError
@@ -123,7 +123,7 @@ def calibrate(
                 "places and more, tilted, near and far, and hold it still"
             )
         given = None if options.intrinsics is None else _given(options.intrinsics, footage)
-        models = [MODELS[options.model]] if options.model else list(WRITTEN)
+        models = [MODELS[options.model]] if options.model else list(CHOICE)
         fitted.append(fit_lens(own, (footage.width, footage.height), models, given))
     for c, one in enumerate(fitted):  # a fit of one camera uses some of its views only
         own = [view for view in views if view.camera == c and view.instant not in one.poses]
@@ -162,6 +162,11 @@ def _given(known: Mapping[str, Camera], footage: Footage) -> Lens:
         raise CalibrationError(
             f"--intrinsics: camera {footage.name} has images of {camera.width}×{camera.height}; those in "
             f"{footage.path} are {footage.width}×{footage.height}, another shape: calibrate its intrinsics again"
+        )
+    if camera.matrix[0, 1] != 0.0:
+        raise CalibrationError(
+            f"--intrinsics: camera {footage.name} has a skew of {camera.matrix[0, 1]:.3g} pixels, which tk calibrate "
+            "does not estimate: calibrate its intrinsics again"
         )
     model = MODELS["fisheye" if camera.fisheye else "pinhole8" if len(camera.distortions) == 8 else "pinhole5"]
     distortion = np.zeros(model.size - 4)

@@ -49,7 +49,9 @@ _OF_WAY = {
     help="Marker's side, of a square's; aprilgrid: gap.  [0.75; 0.3]",
 )
 @click.option("--dictionary", metavar="NAME", help="Markers of the board.  [default: 4x4_50; apriltag_36h11]")
-@click.option("--model", type=click.Choice(["pinhole5", "fisheye"]), help="Lens model.  [default: by held-out views]")
+@click.option(
+    "--model", type=click.Choice(["pinhole5", "pinhole8", "fisheye"]), help="Lens model.  [default: by held-out views]"
+)
 @click.option("--instants", type=click.IntRange(3), metavar="N", help="Use N instants at most.  [default: 120]")
 @click.option(
     "--floor",

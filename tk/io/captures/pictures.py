@@ -93,6 +93,11 @@ def _numbered_pictures(folder: Path) -> tuple[Path, ...]:
 
 
 def read_picture(path: Path, is_mask: bool) -> NDArray[Any]:
+    """Return a picture (H, W, 3) in BGR; of a mask (H, W) or (H, W, channels) as it is stored.
+
+    Raises:
+        VideoError: there is no such file, or it cannot be decoded.
+    """
     if not path.is_file():
         raise VideoError(f"{path}: there is no such file")
     coded = path.read_bytes()
