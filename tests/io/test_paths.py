@@ -19,7 +19,7 @@ TEXT = Kind("a text of mine", (".txt", ".text"), looks_like(rb"mine"))
 def capture(tmp_path: Path) -> Path:
     """A folder with the layout of a capture."""
     folder = tmp_path / "capture"
-    for name in ("videos/cam1.mp4", "images/cam2/000000.png", "masks/cam1.mp4", "background/cam1.png", "vr03_7/0.jpg"):
+    for name in ("videos/cam1.mp4", "images/cam2/000000.png", "masks/cam1.mp4", "background/cam1.png"):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text("mine")
     for name in ("calibration.toml", "capture.toml", "truth.h5", "timestamps"):
@@ -30,7 +30,7 @@ def capture(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     "name",
     ["calibration.toml", "capture.toml", "truth.h5", "videos/cam1.mp4", "videos", "masks/new.txt", "background/x/y.txt",
-     "images/cam2/inspect.png", "images/../videos/new.txt", "vr03_7/new.txt"],
+     "images/cam2/inspect.png", "images/../videos/new.txt"],
 )  # fmt: skip
 def test_no_output_lies_in_the_files_of_a_capture(capture: Path, name: str) -> None:
     with refused(ConfigError, name, "an input of this command", "choose another name"):

@@ -40,7 +40,8 @@ def network(monkeypatch: pytest.MonkeyPatch) -> None:
         return label
 
     monkeypatch.setattr("tk.run.prefetch.make_labeller", make)
-    monkeypatch.setattr("tk.run.plan.sources_of_masks", lambda _: ("learned", "both", "segmenter"))
+    for module in ("plan", "segmentation"):
+        monkeypatch.setattr(f"tk.run.{module}.sources_of_masks", lambda _: ("learned", "both", "segmenter"))
 
 
 class Stop(Silent):

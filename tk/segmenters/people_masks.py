@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from tk.model.body.body_points import LANDMARKS
 from tk.model.cameras.camera import Rig
-from tk.model.cameras.landmark_agreement import associated
+from tk.model.cameras.landmark_agreement import associated, consensus
 from tk.model.cameras.volume import Volume
 from tk.model.hull.coarse import CoarseHull
 from tk.model.masks.sightings import Patch, SeenPerson, Sighting, locate, volume_patch
@@ -187,6 +187,7 @@ class PeopleMasks:
         person = self._empty(self._patches(seen), number)
         for c in seen.cameras:
             self._segment(left, c, person)
+        self._agree(left, person)
         if people and np.count_nonzero(self._new_views(person, people)) < 2:
             return None
         for c in range(len(left)):
@@ -197,6 +198,19 @@ class PeopleMasks:
         for c in range(len(left)):
             person.masks[c] = self._hull.only(hull, c, person.masks[c])
         return person
+
+    def _agree(self, images: Images, person: _Person) -> None:
+        """Where the landmarks show somebody else than in the other cameras, give the segmenter the square around the
+        points that most cameras agree on: people who stand close together are sighted as one."""
+        known = np.isfinite(person.landmarks).all(axis=2).any(axis=1)
+        agree, points = consensus(self._rig, person.landmarks)
+        points = points[np.isfinite(points).all(axis=1)]
+        for c in np.flatnonzero(known & ~agree).tolist() if agree.any() else ():
+            pixels, _ = self._rig[c].project(points)
+            pixels = pixels[np.isfinite(pixels).all(axis=1)]
+            if len(pixels) > 1:
+                person.patches[c] = Patch.about(pixels, _HULL_MARGIN, person.patches[c].angle)
+                self._segment(images, c, person)
 
     def _compare(self, images: Images, person: _Person) -> None:
         """Compare each mask with the hull of the others; where it shows somebody else, or the square fits badly, the

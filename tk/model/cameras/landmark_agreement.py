@@ -9,11 +9,12 @@ images.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.cameras.camera import Rig
+from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.triangulation import triangulate_joints
 from tk.model.cues.landmarks import log_ratio
 
@@ -60,6 +61,26 @@ def associated(rig: Rig, landmarks: Float) -> Float:
     return result
 
 
+def consensus(rig: Rig, seen: Float) -> tuple[NDArray[np.bool_], Float]:
+    """Return (C,) the cameras whose landmarks, of (C, L, 3), show one person, and that person's points (L, 3), metres.
+
+    Each pair of cameras proposes points; those with the highest likelihood in all cameras are the person's, so people
+    who stand close together are told apart. Without a pair that agrees, no camera is returned.
+    """
+    C, L = seen.shape[:2]
+    known = np.flatnonzero(np.isfinite(seen[..., 0]).any(axis=1))
+    best, agree, found = 0.0, np.zeros(C, np.bool_), np.full((L, 3), np.nan)
+    for a, b in combinations(known.tolist(), 2):
+        pair = np.full(seen.shape, np.nan)
+        pair[[a, b]] = seen[[a, b]]
+        points, _ = triangulate_joints(rig, pair)
+        fit = np.array([_fit_of_points(rig[c], seen[c], points) if c in known else np.nan for c in range(C)])
+        support = np.where(fit > 0, fit, 0.0).sum()
+        if fit[a] > 0 and fit[b] > 0 and support > best:
+            best, agree, found = support, fit > 0, points
+    return agree, found
+
+
 def _fit(rig: Rig, seen: Float, c: int, own: Float) -> float:
     """Return the logarithm of the likelihood ratio of landmarks (L, 3) in camera c showing the person whose landmarks
     (C, L, 3) the others see; NaN if fewer than two others see them."""
@@ -68,11 +89,15 @@ def _fit(rig: Rig, seen: Float, c: int, own: Float) -> float:
     known = np.isfinite(own).all(axis=1)
     if np.count_nonzero(np.isfinite(others[..., 0]).any(axis=1)) < 2 or not known.any():
         return np.nan
-    points, _ = triangulate_joints(rig, others)
-    known &= np.isfinite(points).all(axis=1)
+    return _fit_of_points(rig[c], own, triangulate_joints(rig, others)[0])
+
+
+def _fit_of_points(camera: Camera, own: Float, points: Float) -> float:
+    """Return the logarithm of the likelihood ratio of landmarks (L, 3) in a camera showing points (L, 3), nats; NaN if
+    no point is known."""
+    known = np.isfinite(own).all(axis=1) & np.isfinite(points).all(axis=1)
     if not known.any():
         return np.nan
-    camera = rig[c]
     pixels, depth = camera.project(points[known])
     away = (own[known, :2] - pixels) * (depth / np.sqrt(np.linalg.det(camera.matrix[:2, :2])))[:, None]
     return log_ratio(np.linalg.norm(away, axis=1), own[known, 2])
