@@ -95,7 +95,11 @@ def missed(grey: Grey, board: Board) -> str:
         ),
         (make_board("charuco", "5x4", 0.11), "a board 7x5 of these markers is found: give --size 7x5"),
         (make_board("charuco", "9x6", 0.11), "a board 7x5 of these markers is found: give --size 7x5"),
-        (make_board("chessboard", None, 0.11), "a charuco 7x5 of 4x4_50 is found: give --board charuco --size 7x5"),
+        pytest.param(
+            make_board("chessboard", None, 0.11),
+            "a charuco 7x5 of 4x4_50 is found: give --board charuco --size 7x5",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_nearest_miss_is_named(board: Board, part: str) -> None:
@@ -110,6 +114,7 @@ def test_mirrored_blurred_and_flat_images_are_named() -> None:
     assert "one colour" in missed(np.full_like(grey, 30), CHARUCO)
 
 
+@pytest.mark.slow
 def test_inner_corners_of_a_chessboard_are_not_its_squares() -> None:
     grey, _ = picture(make_board("chessboard", "10x7", 0.08), 1.8)
     assert "give --board chessboard --size 10x7" in missed(grey, make_board("chessboard", "9x6", 0.08))
