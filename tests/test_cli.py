@@ -250,7 +250,7 @@ def spoil(path: Path, name: str, value: Any) -> None:
     [
         (
             ["--method", "volumetric"],
-            [("resume", np.zeros(9, np.uint8)), ("resume", "text"), ("model/patches", None)],
+            [("resume", np.zeros(9, np.uint8)), ("resume", "text"), ("model/parts", None)],
         ),
         (["--causal"], [("resume", np.zeros(9, np.uint8)), ("model/parts", None)]),
     ],

@@ -202,7 +202,7 @@ class PeopleMasks:
     def _agree(self, images: Images, person: _Person) -> None:
         """Where the landmarks show somebody else than in the other cameras, give the segmenter the square around the
         points that most cameras agree on: people who stand close together are sighted as one."""
-        known = np.isfinite(person.landmarks).all(axis=2).any(axis=1)
+        known = np.isfinite(person.landmarks[..., 0]).any(axis=1)
         agree, points = consensus(self._rig, person.landmarks)
         points = points[np.isfinite(points).all(axis=1)]
         for c in np.flatnonzero(known & ~agree).tolist() if agree.any() else ():

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.model.landmarks import landmarks_of
+from tests.model.landmarks import body_points, landmarks_of
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, walk
 from tk.model.cameras.camera import Rig
-from tk.model.cameras.landmark_agreement import associated, evidence_for_cameras
+from tk.model.cameras.landmark_agreement import associated, consensus, evidence_for_cameras
 from tk.model.cues.landmarks import log_ratio
 
 RIG = ring_of_cameras(4, 160, 200)
@@ -112,3 +112,22 @@ def test_sets_remain_where_too_few_images_show_the_person() -> None:
     people[:, 2:] = np.nan
     np.testing.assert_array_equal(associated(RIG, people), people)
     assert associated(RIG, people[:0]).shape == (0, 4, 21, 3)
+
+
+def test_people_sighted_as_one_are_told_apart_by_most_cameras() -> None:
+    apart = POSES[0].copy()
+    apart[1] += 0.35  # somebody else at the side
+    one, other = (landmarks_of(RIG, BODY, pose, 0.02, seed=k) for k, pose in enumerate((POSES[0], apart)))
+    mixed = one.copy()
+    mixed[2] = other[2]
+    agree, points = consensus(RIG, mixed)
+    assert agree.tolist() == [True, True, False, True]
+    assert np.nanmedian(np.linalg.norm(points - body_points(BODY, POSES[0]), axis=1)) < 0.05
+    assert consensus(RIG, one)[0].all()
+
+
+def test_no_camera_agrees_without_a_pair_that_shows_one_person() -> None:
+    alone = np.full((4, 21, 3), np.nan)
+    alone[1] = landmarks_of(RIG, BODY, POSES[0], 0.02)[1]
+    agree, points = consensus(RIG, alone)
+    assert not agree.any() and np.isnan(points).all()
