@@ -38,7 +38,7 @@ def explain_miss(footage: Footage, board: Board, others: Sequence[str] = ()) -> 
 
     Args:
         footage: of the camera.
-        board: the board that was looked for.
+        board: the board that was searched for.
         others: further cameras without the board.
     """
     also = f" (nor in {', '.join(others)})" if others else ""

@@ -27,7 +27,7 @@ from tk.model.body.rotations import decompose, follow
 BVH_UNITS = {"m": 1.0, "cm": 100.0}
 _POSITION = ("Xposition", "Yposition", "Zposition")
 _ROTATION = ("Zrotation", "Xrotation", "Yrotation")
-# m, deviation of a joint above which the user is told
+# m, deviation of a joint above which a note is printed
 _NOTED_M = 0.01
 
 

@@ -10,7 +10,8 @@ one person if a square shows several, and misses people whom others hide. The ca
    cameras. If the square does not contain the hull or is much too large, or the mask shows somebody else, the segmenter
    gets the square around the hull.
 3. The people who are found are painted over, and the search is repeated until nobody new is found. Detections that
-   match no other camera's are people whom one camera shows.
+   match no other camera's are people whom one camera shows. Where a person's landmarks in a camera show somebody else
+   than in most cameras, the segmenter gets the square around the points that these cameras show.
 4. Where somebody else stands in a person's square, the segmenter gets the square again, with everybody else painted
    over.
 

@@ -49,7 +49,8 @@ STATURE = 0.03
 AT_ONCE = 16
 # Scale at which other poses are optimised.
 LEVEL = 1
-# Seconds within which frames err alike: the likelihood of a frame counts by its share of this time. The negative
+# Seconds within which frames err alike: the likelihood of a frame counts by its share of this time. At 15 Hz and with
+# four views a cost of 0.01 is then one nat, as chosen before. The negative
 # logarithm of a step's probability is its length divided by STEP_M. In frames with pixels of other people another pose
 # costs SHARED nats more, because the masks do not show the colours by which the first pass has chosen.
 CORRELATED_S, STEP_M, SHARED = 0.17, SAME_POSE_M, 1.0

@@ -65,7 +65,7 @@ def consensus(rig: Rig, seen: Float) -> tuple[NDArray[np.bool_], Float]:
     """Return (C,) the cameras whose landmarks, of (C, L, 3), show one person, and that person's points (L, 3), metres.
 
     Each pair of cameras proposes points; those with the highest likelihood in all cameras are the person's, so people
-    who stand close together are told apart. Without a pair that agrees, no camera is returned.
+    who stand close together are separated. Without a pair that agrees, no camera is returned.
     """
     C, L = seen.shape[:2]
     known = np.flatnonzero(np.isfinite(seen[..., 0]).any(axis=1))

@@ -33,23 +33,26 @@ Float = NDArray[np.float64]
 
 # Standard deviation of a landmark in an image, metres along each axis at the person's distance, for a person of average
 # stature: SEEN_M with visibility 1, HIDDEN times as much with visibility 0; and the share of landmarks that are right.
-# Measured on 33 frame sets of six recordings, four of them of people before markers (2,000 landmarks): at a visibility
+# Measured on 33 frame sets, three of them of people before markers (1,860 landmarks): at a visibility
 # above 0.9, of 0.5 and below 0.1, medians of 3.7, 6.1 and 14 cm, and 5, 24 and 50 % beyond 12 cm.
 SEEN_M, HIDDEN, RIGHT_SEEN, RIGHT_HIDDEN = 0.023, 4.0, 0.95, 0.5
 # Density of a wrong landmark, 1/m²: it lies anywhere on a standing person.
 WRONG_DENSITY = 2.0
+# The next two are assumed; neither they nor INDEPENDENT have been calibrated by the share of right choices yet.
 # Probability that a network exchanges left and right of one half of the body in an image.
 EXCHANGED = 0.05
 # Probability that all landmarks of an image are wrong: the network shows somebody else.
 ELSEWHERE = 0.02
-# Standard deviation of a landmark's offset from the body's point along each axis, metres.
+# Standard deviation of a landmark's offset from the body's point along each axis, metres: medians of recordings differ
+# by so much, see tk.model.body.body_points.
 OFFSET_M = 0.02
 # Least visibility of landmarks whose box is compared with the box of a mask, and least overlap of both boxes.
 LEAST_VISIBLE, LEAST_OVERLAP = 0.2, 0.2
 # Joints that must be triangulated before they propose a pose: fewer leave a limb open.
 LEAST_PROPOSED = 6
 # Weight of the landmarks in the contours' equations: these count the edgels of a segment as independent, but clothes
-# and wrong pieces of a mask displace all of them together.
+# and wrong pieces of a mask displace all of them together. With 10 and 20, four real people have errors of 5.8 and 6.2
+# cm instead of 5.2 on average (docs/experiments.md).
 WEIGHT = 5.0
 # Share of the landmarks' likelihood that counts: a network's errors in neighbouring landmarks go together.
 INDEPENDENT = 0.5

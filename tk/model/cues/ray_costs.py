@@ -30,8 +30,8 @@ COLOR_COST = 0.4
 # Cost of a part on a pixel outside the mask that is uncertain (a shadow, or clothes of the background's colour): both
 # values are equally likely.
 UNCERTAIN_COST = 0.5
-# Negative logarithm of a likelihood for a view's cost of 1: a person's silhouette consists of some 60 areas that err
-# independently, and an area is wrong with a probability of 0.1 to 0.3 (NATS = 60 · log(0.73 / 0.27)).
+# Negative logarithm of a likelihood for a view's cost of 1. With four views a cost of 0.004 is then one nat: the least
+# gain that replaced a pose when costs were shares. Not yet calibrated by the share of right choices.
 VIEW_NATS = 60.0
 # Costs of a view are divided by the number of the person's rays. Where others hide most of the person, the divisor is
 # at least this share of the largest number in any view, so that a hand beside a back counts less than a person.
