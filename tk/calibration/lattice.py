@@ -21,7 +21,7 @@ Float = NDArray[np.float64]
 Ids = NDArray[np.int64]
 Grey = NDArray[np.uint8]
 
-#: scales at which saddles are searched for: smoothing before derivatives, and radius of the ring around a saddle, pixels.
+#: scales of the search for saddles: smoothing before derivatives, and radius of the ring around a saddle, pixels.
 #: The second one is for squares of less than 16 pixels, the third one for blurred images.
 _SCALES = ((1.0, 3.5), (0.7, 2.3), (0.5, 1.6), (2.0, 6.0))
 #: most saddles of an image, the strongest ones; a room has fewer than a thousand
