@@ -28,7 +28,7 @@ from tk.model.setup import Subject
 from tk.run.segmentation import make_labeller
 from tk.run.task import Task
 from tk.settings import Settings
-from tk.trackers.protocol import Observation
+from tk.trackers.protocol import Frame
 from tk.trackers.volumetric import VolumetricTracker
 
 Changes = dict[str, dict[str, Any]]
@@ -58,7 +58,7 @@ class Recorded:
         label = make_labeller(Task.of(self.capture, Settings()), lambda _: None)
         with self.capture.frames() as frames:
             self.frames = [
-                Observation(frame.index, np.array(frame.images), *(np.array(layer) for layer in label(frame)[:2]))
+                Frame(frame.index, np.array(frame.images), *(np.array(layer) for layer in label(frame)[:2]))
                 for frame in frames
             ]
         self.truth = read_joints(path / "truth.h5").positions

@@ -26,7 +26,7 @@ from tk.optim import gauss_newton
 from tk.settings import Settings
 from tk.trackers.bodies import body_and_poses
 from tk.trackers.contour_finder import LINE_SEARCH, SCREEN_ROWS, SOLVER
-from tk.trackers.limb_search import NEARBY
+from tk.trackers.proposals.limbs import NEARBY
 
 Float = np.ndarray
 

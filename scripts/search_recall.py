@@ -23,7 +23,8 @@ import numpy as np
 from scripts.ablation import Recorded
 from tk.model.body.limb_candidates import Limb
 from tk.model.setup import Subject
-from tk.trackers.protocol import Observation
+from tk.trackers.proposals import exchanged, limbs
+from tk.trackers.protocol import Frame
 from tk.trackers.region import RegionTracker
 
 # Candidate poses of a limb tested per frame.
@@ -53,11 +54,10 @@ class Trial:
 class Trials(RegionTracker):
     """The tracker, with a test of its limb search in the frame that it tracked last."""
 
-    def trials(self, frame: Observation) -> Iterator[Trial]:
+    def trials(self, frame: Frame) -> Iterator[Trial]:
         """Displace every limb and yield what the search does."""
-        frame = self.without_foreign(frame)
-        pyramid = self.pyramid(frame)
-        evidence = self.evidence(self.screen, frame, pyramid)
+        seen = self.see(self.without_foreign(frame), frame.images)
+        pyramid, evidence = seen.pyramid, seen.evidence
         pose = self._best.pose
         rng = np.random.default_rng(frame.index)
         own = float(evidence.costs(self.body, pose[None])[0])
@@ -72,9 +72,9 @@ class Trials(RegionTracker):
                     continue
                 misplaced = self.misplaced(evidence, met.label[0])
                 started = time.perf_counter()
-                found, costs = self.search(frame, pyramid, evidence, wrong[0], frame.images, misplaced)
+                proposed = limbs.propose(self, seen, wrong[0], misplaced), exchanged.propose(self, seen, wrong[0])
+                best = self.best(seen, wrong[0], *proposed)
                 seconds = time.perf_counter() - started
-                best = found[int(np.argmin(costs))]
                 yield Trial(limb in misplaced, bool(self._off(limb, best[None], pose)[0] < BACK_M), seconds)
 
     def _off(self, limb: Limb, poses: np.ndarray, pose: np.ndarray) -> np.ndarray:

@@ -29,7 +29,7 @@ from tk.model.setup import Subject
 from tk.optim.gauss_newton import GaussNewtonSettings
 from tk.settings import SilhouetteSettings
 from tk.trackers.contour_finder import LINE_SEARCH, SOLVER
-from tk.trackers.protocol import Observation
+from tk.trackers.protocol import Frame
 from tk.trackers.silhouette import SilhouetteTracker
 
 Float = NDArray[np.float64]
@@ -122,7 +122,7 @@ def track(data: Sequence3D, name: str, views: int, config: Variant) -> tuple[Row
     """Track with the first views; return a row of the tables and the joints (F, 15, 3)."""
     rig = Rig(data.rig.cameras[:views])
     empty = np.zeros(0, np.uint8)
-    frames = [Observation(i, empty, np.ascontiguousarray(m[:views])) for i, m in enumerate(data.masks)]
+    frames = [Frame(i, empty, np.ascontiguousarray(m[:views])) for i, m in enumerate(data.masks)]
     tracker = SilhouetteTracker(rig, data.up, config.settings, config.line_search, config.solver)
     tracker.start(frames[: config.settings.init_frames], Subject(data.height_m))
     estimates = [tracker.step(frame) for frame in frames]

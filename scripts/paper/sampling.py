@@ -26,7 +26,7 @@ from tk.optim import smd
 from tk.run.segmentation import make_labeller
 from tk.run.task import Task
 from tk.settings import Settings
-from tk.trackers.protocol import Observation
+from tk.trackers.protocol import Frame
 from tk.trackers.volumetric import CELL_VOXELS, VolumetricTracker
 
 ANGLES = ("shoulder_r_pitch", "elbow_r_flexion")
@@ -67,7 +67,7 @@ def look(options: Options, paper: Settings) -> Scene:
     tracker = VolumetricTracker(capture.rig, capture.volume, capture.up, config)
     opening = tracker.opening_frames
     with capture.frames(0, options.frames) as frames:
-        seen = (Observation(f.index, f.images.copy(), label(f).masks.copy()) for f in frames)
+        seen = (Frame(f.index, f.images.copy(), label(f).masks.copy()) for f in frames)
         first = list(islice(seen, opening))
         tracker.start(first, Subject(capture.subject_height_m))
         for observation in (*first, *seen):

@@ -11,17 +11,17 @@ from tests.model.test_people import FINDER, RIG, VOLUME, drawn
 from tk.model.people import LocatedPerson
 from tk.model.setup import Setup, Subject
 from tk.run.one_person import really_there
-from tk.trackers.protocol import Observation
+from tk.trackers.protocol import Frame
 
 SETUP = Setup(RIG, VOLUME, "z", 15.0, (Subject(None, 0),))
 
 
-def opening(frames: Sequence[np.ndarray]) -> list[Observation]:
+def opening(frames: Sequence[np.ndarray]) -> list[Frame]:
     """Return observations of masks (C, H, W) bool."""
-    return [Observation(k, np.empty((len(RIG), 0, 0, 3), np.uint8), np.uint8(255) * m) for k, m in enumerate(frames)]
+    return [Frame(k, np.empty((len(RIG), 0, 0, 3), np.uint8), np.uint8(255) * m) for k, m in enumerate(frames)]
 
 
-def both(frames: list[Observation]) -> tuple[Sequence[LocatedPerson], Sequence[LocatedPerson]]:
+def both(frames: list[Frame]) -> tuple[Sequence[LocatedPerson], Sequence[LocatedPerson]]:
     """Return who is found in all cameras, and who is really there."""
     found = FINDER.find(frames[0].masks)
     return found, really_there(FINDER, SETUP, frames, found)

@@ -11,7 +11,7 @@ from tests.people import RIG, person_mask, write_people
 from tk.io.captures.capture import open_capture
 from tk.run.people import People
 from tk.run.task import Task, TrackOptions
-from tk.trackers.protocol import Observation
+from tk.trackers.protocol import Frame
 from tk.trackers.region import RegionTracker
 
 
@@ -24,7 +24,7 @@ def test_an_opening_ends_where_two_people_are_mixed_up(tmp_path: Path, meet: boo
     for k in range(16):
         at = min(0.08 * k, 0.55) - 0.6 if meet else -0.6
         masks = np.stack([person_mask(camera, (at, 0.0)) | person_mask(camera, (-at, 0.1)) for camera in RIG])
-        opening.append(Observation(k, np.zeros((*masks.shape, 3), np.uint8), masks))
+        opening.append(Frame(k, np.zeros((*masks.shape, 3), np.uint8), masks))
     shares = people._shares(people._finder.find(opening[0].masks), opening)
     assert all([frame.index for frame in share] == list(range(len(share))) for share in shares)
     ends = sorted(len(share) for share in shares)

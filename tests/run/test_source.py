@@ -31,7 +31,7 @@ from tk.run.member import Member
 from tk.run.people import People
 from tk.run.session import estimates, track_task
 from tk.run.task import Choice, Task, TrackOptions
-from tk.trackers.protocol import Observation
+from tk.trackers.protocol import Frame
 
 SETTINGS = settings_file.from_toml(QUICK)
 RIG = ring_of_cameras(3, width=160, height=200)
@@ -173,7 +173,7 @@ def test_nobody_in_any_frame_is_an_error_that_leaves_no_file(tmp_path: Path) -> 
 def test_a_start_that_fails_after_somebody_has_entered_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
     begin, attempts, refused_in = People._begin, [], [EMPTY]
 
-    def refuse(people: People, member: Member, frames: Sequence[Observation], *rest: Any) -> None:
+    def refuse(people: People, member: Member, frames: Sequence[Frame], *rest: Any) -> None:
         attempts.append(frames[0].index)
         if frames[0].index in refused_in:
             raise CaptureError("half a person")
@@ -371,7 +371,7 @@ def test_attempts_to_track_somebody_who_is_refused_are_twice_as_far_apart_each_t
 ) -> None:
     begin, attempts = People._begin, []
 
-    def refuse_others(people: People, member: Member, frames: Sequence[Observation], *rest: Any) -> None:
+    def refuse_others(people: People, member: Member, frames: Sequence[Frame], *rest: Any) -> None:
         attempts.append(frames[0].index)
         if member.number > 0:
             raise CaptureError("half a person")

@@ -24,11 +24,11 @@ from tk.model.cameras.common_view import LEAST_INFORMATION, depth_information
 from tk.model.masks.mask_agreement import Agreement
 from tk.model.setup import Subject
 from tk.trackers.camera_monitor import CameraMonitor, MonitorState, opening_agreement
-from tk.trackers.protocol import Estimate, Observation
+from tk.trackers.protocol import Estimate, Frame
 from tk.trackers.region import RegionTracker
 
 CONFIG = settings_file.from_toml(FITTED)
-Spoil = Callable[[Observation], Observation]
+Spoil = Callable[[Frame], Frame]
 
 
 class Scene:
@@ -38,7 +38,7 @@ class Scene:
         self.capture: Capture = open_capture(folder)
         self.setup = self.capture.setup()
         with self.capture.frames() as frames:
-            self.frames = [Observation(f.index, f.images.copy(), np.array(f.masks)) for f in frames]
+            self.frames = [Frame(f.index, f.images.copy(), np.array(f.masks)) for f in frames]
         self.truth = read_joints(folder / "truth.h5").positions
         tracker = self._tracker()
         tracker.start(self.frames[: tracker.opening_frames], Subject(self.capture.subject_height_m))
@@ -71,7 +71,7 @@ def scene(tiny: Path) -> Scene:
 def moved(camera: int, frames: range, by: int = 30) -> Spoil:
     """The camera's masks show the person elsewhere in these frames."""
 
-    def spoil(frame: Observation) -> Observation:
+    def spoil(frame: Frame) -> Frame:
         if frame.index not in frames:
             return frame
         masks = frame.masks.copy()
@@ -84,7 +84,7 @@ def moved(camera: int, frames: range, by: int = 30) -> Spoil:
 def blind(cameras: list[int], frames: range) -> Spoil:
     """The cameras' masks are empty in these frames."""
 
-    def spoil(frame: Observation) -> Observation:
+    def spoil(frame: Frame) -> Frame:
         if frame.index not in frames:
             return frame
         masks = frame.masks.copy()
@@ -98,7 +98,7 @@ def torn(camera: int, frames: range, part: tuple[float, float], uncertain_part: 
     """A part of the person, as shares of the height in the image, is missing from the camera's masks in these frames:
     background or uncertain."""
 
-    def spoil(frame: Observation) -> Observation:
+    def spoil(frame: Frame) -> Frame:
         if frame.index not in frames:
             return frame
         masks = frame.masks.copy()
@@ -167,7 +167,7 @@ def test_sigma_is_unknown_while_the_cameras_left_face_each_other(scene: Scene) -
 
 
 def test_frozen_and_black_cameras_are_excluded_and_reported(scene: Scene) -> None:
-    def spoil(frame: Observation) -> Observation:
+    def spoil(frame: Frame) -> Frame:
         images, masks = frame.images.copy(), frame.masks.copy()
         if frame.index >= 4:
             images[0], masks[0] = scene.frames[4].images[0], scene.frames[4].masks[0]
@@ -199,7 +199,7 @@ def test_person_who_is_elsewhere_without_having_been_lost_is_reported(
 ) -> None:
     step = RegionTracker.step
 
-    def jump(tracker: RegionTracker, frame: Observation) -> Estimate:
+    def jump(tracker: RegionTracker, frame: Frame) -> Estimate:
         estimate = step(tracker, frame)
         return replace(estimate, status="recovered") if frame.index == 7 else estimate
 
@@ -223,7 +223,7 @@ def test_camera_with_torn_mask_is_excluded_until_its_masks_are_whole(scene: Scen
 
 @pytest.mark.parametrize("camera", [1, 2, 3])
 def test_mask_with_surplus_area_is_left_out_if_the_others_fit_better_without_it(scene: Scene, camera: int) -> None:
-    def too_wide(frame: Observation) -> Observation:
+    def too_wide(frame: Frame) -> Frame:
         masks = frame.masks.copy()
         if frame.index >= 4:
             masks[camera] = cv2.dilate(masks[camera], np.ones((9, 9), np.uint8))
@@ -251,7 +251,7 @@ def test_camera_with_half_of_its_mask_uncertain_is_excluded(scene: Scene) -> Non
 
 
 def test_two_cameras_that_turn_slowly_are_excluded(scene: Scene) -> None:
-    def sagging(frame: Observation) -> Observation:
+    def sagging(frame: Frame) -> Frame:
         images, masks = frame.images.copy(), frame.masks.copy()
         for camera in (2, 3):  # the other two cannot know which pair is wrong
             images[camera] = np.roll(images[camera], frame.index // 2, axis=1)
@@ -306,7 +306,7 @@ class Jumping:
     def __init__(self, joints: np.ndarray, when: int) -> None:
         self.joints, self.when = joints, when
 
-    def step(self, frame: Observation) -> Estimate:
+    def step(self, frame: Frame) -> Estimate:
         at = self.joints + (np.array([4.0, 0.0, 0.0]) if frame.index == self.when else 0.0)
         none = np.zeros(0, np.int32)
         return Estimate(np.zeros(24), at, "tracked", 0.0, none, {}, sigma=np.full(15, 0.01))

@@ -14,11 +14,13 @@ from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.model.body.gait_poses import neutral_pose, standing_pose, walking_pose
 from tk.model.body.skeleton import JOINTS, shoulder_angles
+from tk.model.cues.ray_costs import Evidence
 from tk.model.setup import Subject
 from tk.optim.gauss_newton import BatchSolution
 from tk.settings import SilhouetteSettings
-from tk.trackers.initialisation import EXCHANGE, TrajectoryHypothesis, find_person, stature_of
-from tk.trackers.protocol import Observation
+from tk.trackers.hypotheses import DROPPED, TrajectoryHypothesis, walking
+from tk.trackers.initialisation import EXCHANGE, find_person, stature_of
+from tk.trackers.protocol import Frame
 from tk.trackers.silhouette import SilhouetteTracker
 
 STATURE = 1.75
@@ -56,8 +58,8 @@ def tracker_of(stature: float = STATURE) -> SilhouetteTracker:
 def found(poses: np.ndarray) -> np.ndarray:
     """Return (F, 15, 3) joints of the person found in silhouettes of poses (F, D)."""
     tracker = tracker_of()
-    frames = [Observation(i, np.zeros(0, np.uint8), m) for i, m in enumerate(draw_silhouettes(BODY, RIG, poses))]
-    poses = find_person(tracker, frames, [tracker.pyramid(frame) for frame in frames])[0].poses
+    frames = [Frame(i, np.zeros(0, np.uint8), m) for i, m in enumerate(draw_silhouettes(BODY, RIG, poses))]
+    poses = find_person(tracker, [tracker.see(frame) for frame in frames])[0].poses
     return tracker.world.points_out(SKELETON.joints(poses))
 
 
@@ -106,7 +108,7 @@ def test_hypothesis_whose_fitted_body_has_the_lower_cost_is_chosen(monkeypatch) 
     right = placed(arms(standing_pose(SKELETON), (1, 0.6, 0.3), (0.2, 1, -0.6)), 0.6)
     wrong = placed(arms(standing_pose(SKELETON), (0.2, 1, -0.6), (1, 0.6, 0.3)), 0.6)
     masks = draw_silhouettes(BODY, RIG, np.array([right] * 4))
-    frames = [Observation(i, np.zeros(0, np.uint8), m) for i, m in enumerate(masks)]
+    frames = [Frame(i, np.zeros(0, np.uint8), m) for i, m in enumerate(masks)]
     tracker = tracker_of()
     hypotheses = [
         TrajectoryHypothesis(tracker.world.poses_in(np.array([pose] * 4)), nats)
@@ -122,22 +124,27 @@ def test_poses_with_similar_costs_in_one_frame_all_become_hypotheses(monkeypatch
     right = placed(arms(standing_pose(SKELETON), (1, 0.6, 0.3), (0.2, 1, -0.6)), 0.6)
     wrong = placed(arms(standing_pose(SKELETON), (0.2, 0.3, 1), (-0.3, 1, 0.6)), 0.6)
     masks = draw_silhouettes(BODY, RIG, np.array([right] * 4))
-    frames = [Observation(i, np.zeros(0, np.uint8), m) for i, m in enumerate(masks)]
+    frames = [Frame(i, np.zeros(0, np.uint8), m) for i, m in enumerate(masks)]
     tracker = tracker_of()
     monkeypatch.setattr(
         tracker, "settle", lambda _, starts, *__: BatchSolution(np.array(starts), np.zeros(0), np.zeros(3, np.int32))
     )
-    monkeypatch.setattr("tk.trackers.initialisation.gait.hypotheses", lambda *_: np.array([wrong, right]))
-    monkeypatch.setattr("tk.trackers.initialisation.REFINED", 1)
-    monkeypatch.setattr("tk.trackers.initialisation._searched", lambda _, __, ___, pose: pose)
+    starts = tracker.world.poses_in(np.array([wrong, right]))
+    monkeypatch.setattr("tk.trackers.proposals.anywhere.gait.hypotheses", lambda *_: starts)
+    monkeypatch.setattr("tk.trackers.proposals.exchanged.propose", lambda *_: starts)
+    monkeypatch.setattr("tk.trackers.proposals.anywhere.REFINED", 1)
+    monkeypatch.setattr("tk.trackers.initialisation._searched", lambda _, __, pose: pose)
     costs = {False: 20.0, True: 20.5}
-    monkeypatch.setattr(tracker, "score", lambda _, poses, __: np.array([costs[np.allclose(p, right)] for p in poses]))
+    inside = tracker.world.poses_in(right)
+    monkeypatch.setattr(
+        Evidence, "score", lambda _, __, poses: np.array([costs[np.allclose(p, inside)] for p in poses])
+    )
     monkeypatch.setattr(tracker, "mean_residual", lambda _, poses, __: np.full(len(poses), 0.21))
-    monkeypatch.setattr(tracker, "improved", lambda _, __, pose: pose)
-    hypotheses = find_person(tracker, frames, [tracker.pyramid(frame) for frame in frames])
+    monkeypatch.setattr(tracker, "improved", lambda _, pose: pose)
+    hypotheses = find_person(tracker, [tracker.see(frame) for frame in frames])
     # the second pose faces the same way, which is improbable from the start
     assert [hypothesis.cost for hypothesis in hypotheses] == pytest.approx([20.0, 20.5 + EXCHANGE])
-    assert error(SKELETON.joints(hypotheses[1].poses[0])[None], right[None])[0] < 1e-6
+    assert error(SKELETON.joints(hypotheses[1].poses[0])[None], inside[None])[0] < 1e-6
 
 
 @pytest.mark.parametrize("stature", [1.2, 1.6, 1.95])
@@ -150,7 +157,7 @@ def test_estimated_stature_hardly_depends_on_the_pose(stature: float) -> None:
         pose = pose.copy()
         pose[2] *= stature / STATURE
         tracker = tracker_of()
-        statures.append(stature_of(tracker, [tracker.pyramid(Observation(0, np.zeros(0, np.uint8), m))
+        statures.append(stature_of(tracker, [tracker.pyramid(Frame(0, np.zeros(0, np.uint8), m))
                                              for m in draw_silhouettes(body, RIG, pose[None])]))  # fmt: skip
     np.testing.assert_allclose(statures, stature, rtol=0.09)
 
@@ -161,7 +168,7 @@ def test_lower_hull_corrects_the_stature_of_wide_clothes(monkeypatch, hull_m: fl
     tracker = SilhouetteTracker(RIG, "z", SilhouetteSettings(adapt=False))
     bare = draw_silhouettes(BODY, RIG, placed(standing_pose(SKELETON), 0.5)[None])[0]
     masks = np.array([cv2.dilate(mask, np.ones((5, 5), np.uint8)) for mask in bare])
-    frame = Observation(0, np.zeros(0, np.uint8), masks)
+    frame = Frame(0, np.zeros(0, np.uint8), masks)
     apparent = stature_of(tracker, [tracker.pyramid(frame)])
     monkeypatch.setattr(
         "tk.trackers.contour_finder.find_person", lambda *_: [TrajectoryHypothesis(np.zeros((1, 1)), 0.1)]
@@ -176,46 +183,56 @@ def test_height_that_contradicts_the_silhouettes_is_refused(height: float) -> No
     tracker = tracker_of()
     masks = draw_silhouettes(tracker.body, RIG, placed(standing_pose(SKELETON), 0.4)[None])[0]
     with pytest.raises(CaptureError, match=f"height of {height:.2f} m contradicts the silhouettes.*about 1.7"):
-        tracker.find([Observation(0, np.zeros(0, np.uint8), masks)], Subject(height))
+        tracker.find([Frame(0, np.zeros(0, np.uint8), masks)], Subject(height))
 
 
 def test_empty_first_frame_is_refused() -> None:
     tracker = tracker_of()
-    empty = Observation(7, np.zeros(0, np.uint8), np.zeros((3, 250, 200), np.uint8))
+    empty = Frame(7, np.zeros(0, np.uint8), np.zeros((3, 250, 200), np.uint8))
     with pytest.raises(CaptureError, match="0 of 3 masks of frame 7 show anybody, two are needed"):
-        find_person(tracker, [empty], [tracker.pyramid(empty)])
+        find_person(tracker, [tracker.see(empty)])
 
 
 def test_masks_that_no_pose_explains_are_refused(monkeypatch) -> None:
     tracker = tracker_of()
     masks = draw_silhouettes(tracker.body, RIG, placed(standing_pose(SKELETON), 0.4)[None])[0]
-    frame = Observation(7, np.zeros(0, np.uint8), masks)
+    frame = Frame(7, np.zeros(0, np.uint8), masks)
     monkeypatch.setattr(tracker, "mean_residual", lambda _, poses, __: np.full(len(poses), 0.8))
-    monkeypatch.setattr(tracker, "improved", lambda _, __, pose: pose)
+    monkeypatch.setattr(tracker, "improved", lambda _, pose: pose)
     with pytest.raises(CaptureError, match="no pose of a person explains the masks: the best one leaves 80%"):
-        find_person(tracker, [frame], [tracker.pyramid(frame)])
+        find_person(tracker, [tracker.see(frame)])
 
 
-@pytest.mark.parametrize("yaw", [0.4, 0.4 + np.pi])
-def test_recovered_person_keeps_the_heading_where_silhouettes_are_ambiguous(monkeypatch, yaw):
+def test_heading_as_before_is_preferred_where_silhouettes_are_ambiguous(monkeypatch) -> None:
     tracker = tracker_of()
-    before, there = (placed(standing_pose(SKELETON), yaw) for _ in range(2))
-    before[0] += 1.0
-    pyramid = tracker.pyramid(Observation(0, np.zeros(0, np.uint8), draw_silhouettes(BODY, RIG, there[None])[0]))
-    facing = SKELETON.index("torso_yaw")
+    before, other = (placed(standing_pose(SKELETON), yaw) for yaw in (0.4, 0.4 + np.pi))
+    seen = tracker.see(Frame(0, np.zeros(0, np.uint8), draw_silhouettes(BODY, RIG, before[None])[0]))
     monkeypatch.setattr(
-        tracker, "settle", lambda _, starts, levels: BatchSolution(starts, np.zeros(0), np.zeros(len(levels), np.int32))
+        tracker, "settle", lambda _, starts, *__: BatchSolution(starts, np.zeros(0), np.zeros(1, np.int32))
     )
+    yaw = SKELETON.index("torso_yaw")
 
-    def residual_function(better_if_turned):
-        return lambda _, poses: 0.2 - better_if_turned * (np.cos(poses[:, facing] - yaw) < -0.9)
+    class Gains:
+        def __init__(self, nats: float) -> None:
+            self.nats = nats
 
-    for gain, turned in ((0.0, False), (0.03, False), (0.1, True)):
-        monkeypatch.setattr(tracker, "mean_residual", residual_function(gain))
-        pose, error = tracker.recover(pyramid, before, 1.0)
-        assert (np.cos(pose[facing] - yaw) < 0) == turned
-        assert error == pytest.approx(0.2 - gain * turned)
-    np.testing.assert_array_equal(tracker.recover(pyramid, before, 0.05)[0], before)
+        def score(self, _, poses: np.ndarray) -> np.ndarray:
+            return -self.nats * (np.cos(poses[:, yaw] - before[yaw]) < 0)
+
+    for gain, turned in ((0.0, False), (DROPPED - 1.0, False), (DROPPED + 1.0, True)):
+        monkeypatch.setattr(tracker, "evidence", lambda *_, gain=gain: Gains(gain))
+        pose = tracker.best(seen, before, other[None])
+        assert (np.cos(pose[yaw] - before[yaw]) < 0) == turned
+
+
+def test_people_walk_forwards() -> None:
+    ahead = np.array([placed(walking_pose(SKELETON, 0.1 * k), 0.5) for k in range(10)])
+    back = ahead.copy()
+    ahead[:, :2] += np.linspace(0, 1.2, 10)[:, None] * [np.cos(0.5), np.sin(0.5)]
+    back[:, :2] -= np.linspace(0, 1.2, 10)[:, None] * [np.cos(0.5), np.sin(0.5)]
+    cost = walking(SKELETON, np.stack([ahead, back]))
+    assert 1.5 < cost[1] - cost[0] < 3.0
+    assert walking(SKELETON, np.repeat(ahead[:1], 5, axis=0)) == 0.0
 
 
 def test_landmarks_tell_the_heading_that_silhouettes_leave_open() -> None:
@@ -226,7 +243,7 @@ def test_landmarks_tell_the_heading_that_silhouettes_leave_open() -> None:
     masks = draw_silhouettes(BODY, RIG, np.stack([facing, back])).max(axis=0)
     for pose in (facing, back):
         seen = landmarks_of(RIG, BODY, pose, 0.03)[None]
-        frame = Observation(0, np.zeros(0, np.uint8), masks, landmarks=seen)
+        frame = Frame(0, np.zeros(0, np.uint8), masks, landmarks=seen)
         pyramid = tracker.pyramid(frame)
         assert pyramid.landmarks is not None
         score = tracker.score(pyramid, tracker.world.poses_in(np.stack([facing, back])))
@@ -239,8 +256,8 @@ def test_start_with_landmarks_begins_with_their_pose(monkeypatch) -> None:
     pose = placed(arms(standing_pose(SKELETON), (1, 0.0, 0.1), (1, 0.0, -0.4)), 2.9, **seated)
     masks = draw_silhouettes(BODY, RIG, pose[None])[0]
     tracker = tracker_of()
-    frame = Observation(0, np.zeros(0, np.uint8), masks, landmarks=landmarks_of(RIG, BODY, pose, 0.02)[None])
+    frame = Frame(0, np.zeros(0, np.uint8), masks, landmarks=landmarks_of(RIG, BODY, pose, 0.02)[None])
     far = placed(standing_pose(SKELETON), 6.0)
-    monkeypatch.setattr("tk.trackers.initialisation.gait.hypotheses", lambda *_: np.array([far]))
-    found = find_person(tracker, [frame], [tracker.pyramid(frame)])[0].poses
+    monkeypatch.setattr("tk.trackers.proposals.anywhere.gait.hypotheses", lambda *_: np.array([far]))
+    found = find_person(tracker, [tracker.see(frame)])[0].poses
     assert error(tracker.world.points_out(SKELETON.joints(found)), pose[None])[0] < 0.04

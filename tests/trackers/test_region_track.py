@@ -33,7 +33,7 @@ from tk.run.plan import recording_task
 from tk.run.session import Summary, estimates
 from tk.run.task import RecordingOptions, Task
 from tk.trackers.bodies import body_and_poses, read_body
-from tk.trackers.protocol import Estimate, Observation
+from tk.trackers.protocol import Estimate, Frame
 from tk.trackers.region import RegionTracker
 
 CONFIG = settings_file.from_toml(QUICK)
@@ -302,7 +302,7 @@ def test_frames_without_known_joints_are_reported(
 ) -> None:
     step = RegionTracker.step
 
-    def unsure(tracker: RegionTracker, frame: Observation) -> Estimate:
+    def unsure(tracker: RegionTracker, frame: Frame) -> Estimate:
         estimate = step(tracker, frame)
         return replace(estimate, sigma=np.full(15, np.nan)) if frame.index in (2, 3) else estimate
 
@@ -328,7 +328,7 @@ def test_a_person_who_was_tracked_back_to_front_is_tracked_again(
 ) -> None:
     start = RegionTracker.start
 
-    def start_turned(tracker: RegionTracker, frames: Sequence[Observation], subject: Subject) -> None:
+    def start_turned(tracker: RegionTracker, frames: Sequence[Frame], subject: Subject) -> None:
         start(tracker, frames, subject)
         pose = tracker.world.poses_out(tracker.last_poses()[0][None])[0]
         tracker.start_at(tracker.turned_pose(pose))

@@ -12,7 +12,7 @@ from tk.kernels.mask_values import OTHERS
 from tk.kernels.raycast import FAR
 from tk.model.cues.part_colors import RenderedBody, color_bins
 from tk.model.cues.ray_costs import RayGrid
-from tk.trackers.protocol import Observation
+from tk.trackers.protocol import Frame
 from tk.trackers.sharing import NOBODY, assign, enlarged
 
 RIG = ring_of_cameras(4, width=160, height=200)
@@ -25,14 +25,14 @@ COLORS = np.array([[200, 40, 40], [40, 40, 200], [40, 200, 40]], np.uint8)
 GREY = np.array([90, 90, 90], np.uint8)
 
 
-def drawn(poses: np.ndarray, colors: np.ndarray = COLORS) -> tuple[np.ndarray, Observation]:
+def drawn(poses: np.ndarray, colors: np.ndarray = COLORS) -> tuple[np.ndarray, Frame]:
     """Return (V, H, W) who is in front in each pixel, -1 for nobody, and the observation of everybody."""
     met = [EXACT.render(BODY, pose[None]) for pose in poses]
     depth = np.array([one.depth[0] for one in met])
     covered = np.array([one.label[0] > 0 for one in met])
     front = np.where(covered.any(axis=0), depth.argmin(axis=0), -1)
     images = np.where(front[..., None] >= 0, colors[front], GREY)
-    return front, Observation(0, images, np.where(front >= 0, np.uint8(255), np.uint8(0)))
+    return front, Frame(0, images, np.where(front >= 0, np.uint8(255), np.uint8(0)))
 
 
 def expected(pose: np.ndarray, color: np.ndarray | None = None) -> RenderedBody:
@@ -45,7 +45,7 @@ def expected(pose: np.ndarray, color: np.ndarray | None = None) -> RenderedBody:
     return RenderedBody(met.label[0], met.depth[0], np.zeros(len(BODY.parts), np.int32), log_likelihood)
 
 
-def right(bodies: list[RenderedBody], front: np.ndarray, frame: Observation) -> float:
+def right(bodies: list[RenderedBody], front: np.ndarray, frame: Frame) -> float:
     """Return the share of the people's pixels with the right owner."""
     owner, shown = assign(RIG, GRID, bodies, frame).owner, front >= 0
     return np.count_nonzero((owner == front) & shown) / np.count_nonzero(shown)
@@ -80,11 +80,11 @@ def block(left: int, right: int, depth_m: float) -> RenderedBody:
     return RenderedBody(label, np.where(label > 0, np.float32(depth_m), np.float32(FAR)))
 
 
-def masks_of(*bodies: RenderedBody) -> Observation:
+def masks_of(*bodies: RenderedBody) -> Frame:
     """Return an observation without images whose masks show the bodies."""
     shown = np.any([body.label > 0 for body in bodies], axis=0)
     masks = np.array([enlarged(one.astype(np.uint8) * np.uint8(255), GRID.step, SHAPE[1:]) for one in shown])
-    return Observation(0, np.zeros((*SHAPE[:1], 0, 0, 3), np.uint8), masks)
+    return Frame(0, np.zeros((*SHAPE[:1], 0, 0, 3), np.uint8), masks)
 
 
 @pytest.mark.parametrize("first", [2.0, 3.0])

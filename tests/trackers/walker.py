@@ -10,7 +10,7 @@ from tk.model.body.cone_body import build_cone_body
 from tk.model.body.gait_poses import walking_pose
 from tk.model.cameras.camera import Rig
 from tk.trackers.contour_tracker import ContourTracker
-from tk.trackers.protocol import Estimate, Observation
+from tk.trackers.protocol import Estimate, Frame
 
 STATURE = 1.75
 BODY = build_cone_body(BodyDimensions.from_stature(STATURE))
@@ -26,8 +26,8 @@ def walk(count: int, first: float = 0.0) -> np.ndarray:
     return poses
 
 
-def observe(masks: np.ndarray, index: int = 0, images: np.ndarray = EMPTY) -> Observation:
-    return Observation(index, images, masks)
+def observe(masks: np.ndarray, index: int = 0, images: np.ndarray = EMPTY) -> Frame:
+    return Frame(index, images, masks)
 
 
 def errors(estimate: Estimate, pose: np.ndarray) -> np.ndarray:

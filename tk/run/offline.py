@@ -48,9 +48,8 @@ CONTRADICTED = (
     "of another recording, moved cameras, or videos of different recordings (see tk inspect)"
 )
 
-# Frames in which the opposite heading is compared. With 8, 12 and 20, the decisions about five faults of a
-# generated recording, two of them tracked back to front, are right in 5, 5 and 4.
-HEADING_FRAMES = 12
+# Frames in which the opposite heading is compared.
+HEADING_FRAMES = 8
 
 #: entry in `/model` of a result after the second pass
 REFINED = "refined"
@@ -219,11 +218,10 @@ class _Finisher:
     def _with_true_heading(
         self, tracker: TwoPassTracker, masks: MaskStore, draft: _Draft, height_m: float | None
     ) -> TwoPassTracker:
-        """If the opposite heading explains the frames nearly as well, track the person again with both headings; keep
-        the opposite one if it has the lower residual. Return the tracker of the heading that is kept.
+        """If the opposite heading is not improbable, track the person again with both headings, each with its body;
+        keep the more probable one. Return the tracker of the heading that is kept.
 
         A few views of a person who stands upright at the start hardly show where the front is; a whole recording does.
-        Both bodies are fitted to the whole recording, so that neither heading has an advantage.
         """
         rows = np.flatnonzero(~draft.lost)
         if not len(rows) or self.task.source.frame_count is None:
@@ -231,23 +229,23 @@ class _Finisher:
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, HEADING_FRAMES).round().astype(int))]
         poses, unused = draft.current("pose"), np.isnan(draft.current("residual")[..., 0])
         shown = [np.where(unused[row][:, None, None], 0, masks.get(int(draft.result.frames[row]))) for row in rows]
-        hypotheses = tracker.heading_hypotheses(shown, poses[rows], height_m)
+        landmarks = self._landmarks(draft, self._late)
+        seen = None if landmarks is None else np.where(unused[rows][:, :, None, None], np.nan, landmarks[rows])
+        hypotheses = tracker.headings(shown, poses[rows], height_m, seen)
         if not hypotheses:
             return tracker
         _LOG.info("tracking with both headings: which way the person faces is unclear")
         start = poses[np.flatnonzero(draft.result.status != Status.ABSENT)[0]]
         for hypothesis, pose in zip(hypotheses, (start, tracker.turned_pose(start)), strict=True):
             hypothesis.start_at(pose)
-        drafts, seen = self._tracked_by(hypotheses, draft, unused), masks.sequence(draft.result.frames)
-        residual = []
+        drafts, costs = self._tracked_by(hypotheses, draft, unused), []
         for hypothesis, one in zip(hypotheses, drafts, strict=True):
             first = one.current("pose"), one.lost, one.current("residual")
             again = hypothesis.second_pass(
-                seen, *first, height_m, self._landmarks(draft, self._late), True, self.within
+                masks.sequence(draft.result.frames), *first, height_m, landmarks, True, self.within
             )
-            residual.append(again[1].sum(axis=-1))
-        both = ~(drafts[0].lost | drafts[1].lost)
-        if not np.nanmean(residual[1][both]) < np.nanmean(residual[0][both]):
+            costs.append(hypothesis.cost(shown, again[0][rows], seen))
+        if costs[0] <= costs[1]:
             return tracker
         draft.lost, draft.columns = drafts[1].lost, drafts[1].columns
         self.note("the person faces the other way than the first frames seemed to show: tracked again")

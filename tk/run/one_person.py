@@ -12,7 +12,7 @@ from tk.model.cameras.camera import Rig
 from tk.model.people import LocatedPerson, PeopleFinder
 from tk.model.setup import Setup
 from tk.trackers.camera_monitor import opening_agreement
-from tk.trackers.protocol import Observation, without_cameras
+from tk.trackers.protocol import Frame, without_cameras
 
 # A camera shows a person if its mask covers this share of the person's hull from the other cameras. Right cameras of
 # the demo cover 0.84 and more: the hull is larger than the person. One that is upside down covers 0.19.
@@ -20,7 +20,7 @@ _SHOWN = 0.5
 
 
 def really_there(
-    finder: PeopleFinder, setup: Setup, opening: Sequence[Observation], found: tuple[LocatedPerson, ...]
+    finder: PeopleFinder, setup: Setup, opening: Sequence[Frame], found: tuple[LocatedPerson, ...]
 ) -> tuple[LocatedPerson, ...]:
     """Return the people in the first frame of an opening: those just ``found`` in all cameras, or one.
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,9 +37,11 @@ from tk.optim import gauss_newton
 from tk.optim.gauss_newton import BatchSolution, GaussNewtonSettings
 from tk.optim.quadratic import Quadratic
 from tk.settings import SilhouetteSettings
-from tk.trackers.initialisation import TrajectoryHypothesis, centroid, find_person, stature_of
-from tk.trackers.limb_search import LimbSearch
-from tk.trackers.protocol import Observation
+from tk.trackers.hypotheses import SAME_POSE_M, TrajectoryHypothesis, turning
+from tk.trackers.initialisation import find_person, stature_of
+from tk.trackers.proposals import exchanged, limbs
+from tk.trackers.proposals.anywhere import centroid
+from tk.trackers.protocol import Frame
 
 Float = NDArray[np.float64]
 
@@ -60,6 +62,23 @@ LINE_SEARCH = SearchSettings()
 # Half this tolerance, or none, leaves the mean joint error on eight captures unchanged to 0.02 cm; twice as much makes
 # fast arms worse by 0.1 cm.
 SOLVER = GaussNewtonSettings(scales=3, relaxation=1.6, tolerance=0.012)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a frame shows of one person.
+
+    Attributes:
+        frame: the frame.
+        pyramid: its silhouettes, and the person's landmarks.
+        evidence: its costs on the grid :attr:`ContourFinder.screen`.
+        images: as in :meth:`ContourFinder.settle`.
+    """
+
+    frame: Frame
+    pyramid: Pyramid
+    evidence: Evidence
+    images: NDArray[np.uint8] | None = None
 
 
 class ContourFinder:
@@ -105,6 +124,11 @@ class ContourFinder:
         return max(int(seconds * self.fps), 1) if seconds else 0
 
     @property
+    def search_level(self) -> int:
+        """The scale at which proposed limbs settle."""
+        return min(1, self.solver.scales - 1)
+
+    @property
     def opening_frames(self) -> int:
         """Number of frames used by the initialisation."""
         return self.contours.init_frames
@@ -136,7 +160,7 @@ class ContourFinder:
 
     # --- initialisation (silhouette paper, section 4.6) ---------------------------------------------------------
 
-    def find(self, frames: Sequence[Observation], subject: Subject) -> Float:
+    def find(self, frames: Sequence[Frame], subject: Subject) -> Float:
         """Return the pose (D,) in the first of the frames; the body is fitted to all of them.
 
         Args:
@@ -170,16 +194,17 @@ class ContourFinder:
         self.take_body(subject.body or build_cone_body(average))
         if init is not None:
             rough = self.settle(pyramids[0], convert_poses(angles, given, self.body.skeleton)[None]).states[0]
-        with self._opening_cameras(frames, pyramids) as seen:
-            hypotheses = find_person(self, *seen, rough)
+        with self._opening_cameras(frames, pyramids) as (some, silhouettes):
+            seen = [self.see(blind(f), pyramid=shown) for f, shown in zip(some, silhouettes, strict=True)]
+            hypotheses = find_person(self, seen, rough)
         if not self.contours.adapt or subject.body is not None:
             return np.asarray(hypotheses[0].poses[0])
         return self._adapt(frames, pyramids, hypotheses, average.stature, stature is not None)
 
     @contextmanager
     def _opening_cameras(
-        self, frames: Sequence[Observation], pyramids: Sequence[Pyramid]
-    ) -> Iterator[tuple[Sequence[Observation], Sequence[Pyramid]]]:
+        self, frames: Sequence[Frame], pyramids: Sequence[Pyramid]
+    ) -> Iterator[tuple[Sequence[Frame], Sequence[Pyramid]]]:
         """Use at most :data:`OPENING_CAMERAS` inside, those from the most different sides; yield their share."""
         rig = self.world.rig
         # a camera that sees nobody in the first frame is no use for the search
@@ -202,7 +227,7 @@ class ContourFinder:
 
     def _adapt(
         self,
-        frames: Sequence[Observation],
+        frames: Sequence[Frame],
         pyramids: Sequence[Pyramid],
         hypotheses: Sequence[TrajectoryHypothesis],
         stature: float,
@@ -234,7 +259,7 @@ class ContourFinder:
         self.take_body(body)
         return np.asarray(pose)
 
-    def _converged_score(self, frame: Observation, pyramid: Pyramid, pose: Float) -> float:
+    def _converged_score(self, frame: Frame, pyramid: Pyramid, pose: Float) -> float:
         """Return the cost of the pose that a pose (D,) converges to, nats; uncertain pixels count half."""
         return float(self.score(pyramid, self.settle(pyramid, pose[None]).states, frame.uncertain)[0])
 
@@ -252,7 +277,7 @@ class ContourFinder:
 
     # --- one frame ----------------------------------------------------------------------------------------------
 
-    def pyramid(self, frame: Observation) -> Pyramid:
+    def pyramid(self, frame: Frame) -> Pyramid:
         """Return the frame's silhouettes, cleaned, at all scales, and the person's landmarks."""
         pyramid = self.views.pyramid(frame.masks, self.solver.scales, True)
         return replace(pyramid, landmarks=of_person(frame.landmarks, pyramid.masks[0]))
@@ -310,10 +335,16 @@ class ContourFinder:
 
         return both
 
-    def evidence(self, grid: RayGrid, frame: Observation, pyramid: Pyramid) -> Evidence:
+    def evidence(self, grid: RayGrid, frame: Frame, pyramid: Pyramid) -> Evidence:
         """Return the costs of a frame on a grid of rays, and by its landmarks."""
         landmarks = self.landmarks(pyramid)
-        return Evidence.of(grid, pyramid.masks[0], frame.uncertain, frame.images, self.colors, landmarks)
+        colors = self.colors if frame.images.size else None
+        return Evidence.of(grid, pyramid.masks[0], frame.uncertain, frame.images, colors, landmarks)
+
+    def see(self, frame: Frame, images: NDArray[np.uint8] | None = None, pyramid: Pyramid | None = None) -> Seen:
+        """Return what a frame shows; ``images`` as in :meth:`settle`, ``pyramid`` that of the frame, if known."""
+        pyramid = pyramid or self.pyramid(frame)
+        return Seen(frame, pyramid, self.evidence(self.screen, frame, pyramid), images)
 
     def score(self, pyramid: Pyramid, poses: Float, uncertain: NDArray[np.bool_] | None = None) -> Float:
         """Return (B,) the negative logarithm of the likelihood of a frame without colours, nats."""
@@ -326,55 +357,37 @@ class ContourFinder:
         evidence = Evidence.of(self.screen, pyramid.masks[0], uncertain)
         return evidence.costs(self.body, poses)
 
-    def search(
-        self,
-        frame: Observation,
-        pyramid: Pyramid,
-        evidence: Evidence,
-        pose: Float,
-        images: NDArray[np.uint8] | None = None,
-        misplaced: Sequence[Limb] | None = (),
-        further: Float | None = None,
-    ) -> tuple[Float, Float]:
-        """Search for better poses of the limbs, see :mod:`tk.trackers.limb_search`, and settle the best of them.
+    def compared(self, seen: Seen, pose: Float, *proposed: Float) -> tuple[Float, Float]:
+        """Settle proposed poses (B, D). Return a pose (D,) and those of them that differ from it, (1 + B', D), and the
+        negative logarithms of their posteriors, nats, up to a constant of the frame."""
+        skeleton, found = self.body.skeleton, np.concatenate(proposed)
+        if len(found):
+            found = self.settle(seen.pyramid, found, (0,), seen.images).states
+        found = np.concatenate([pose[None], found[skeleton.apart(found, skeleton.joints(pose)) > SAME_POSE_M]])
+        cost = self.evidence(self.choice, seen.frame, seen.pyramid).score(self.body, found)
+        return found, cost + turning(skeleton, found, pose)
 
-        Args:
-            frame, pyramid, evidence: the frame, its silhouettes, its costs on the grid :attr:`screen`.
-            pose: (D,) current pose.
-            images: as in :meth:`settle`.
-            misplaced: limbs that are known to be misplaced; None: limbs are not searched for.
-            further: (B, D) other poses that are settled and compared.
-
-        Returns:
-            Poses (B, D), the current one first, and their costs (B,), nats.
-        """
-
-        def settle(poses: Float, levels: Sequence[int], limb: Limb | None) -> Float:
-            return self.settle(pyramid, poses, levels, images, limb=limb).states
-
-        found = pose[None]
-        if misplaced is not None:
-            search = LimbSearch(self.body, self.limbs, evidence, settle, pose)
-            rng = np.random.default_rng([7, frame.index, self.seed])
-            best = search.better(min(1, self.solver.scales - 1), misplaced, rng)
-            if len(best):
-                found = np.concatenate([found, settle(best, (0,), None)])
-        if further is not None and len(further):
-            found = np.concatenate([found, self.settle(pyramid, further, None, images).states])
-        return found, self.evidence(self.choice, frame, pyramid).score(self.body, found)
-
-    def improved(self, frame: Observation, pyramid: Pyramid, pose: Float) -> Float:
-        """Return the pose (D,), or the best one of a limb search if that costs less."""
-        poses, cost = self.search(frame, pyramid, self.evidence(self.screen, frame, pyramid), pose)
+    def best(self, seen: Seen, pose: Float, *proposed: Float) -> Float:
+        """Return the most probable (D,) of a pose and proposed ones."""
+        poses, cost = self.compared(seen, pose, *proposed)
         return np.asarray(poses[int(np.argmin(cost))])
+
+    def improved(self, seen: Seen, pose: Float) -> Float:
+        """Return the most probable (D,) of a pose and what a search for its limbs proposes."""
+        return self.best(seen, pose, limbs.propose(self, seen, pose), exchanged.propose(self, seen, pose))
 
     def model(self) -> Mapping[str, Any]:
         """Return the body as stored in `/model`."""
         return body_values(self.body)
 
 
-def _only(frame: Observation, views: NDArray[np.intp]) -> Observation:
-    """Return a frame of some views, without images, which the search at the start does not use."""
+def blind(frame: Frame) -> Frame:
+    """Return the frame without images, for what does not use colours."""
+    return replace(frame, images=frame.images[:0])
+
+
+def _only(frame: Frame, views: NDArray[np.intp]) -> Frame:
+    """Return a frame of some views, without images."""
     uncertain = None if frame.uncertain is None else frame.uncertain[views]
     sources = None if frame.sources is None else frame.sources[views]
     images = np.empty((len(views), 0, 0, 3), np.uint8)

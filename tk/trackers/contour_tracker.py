@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError
 from tk.kernels.mask_values import PERSON
-from tk.model.body import gait_poses as gait
 from tk.model.body.stored_body import restore_body
 from tk.model.cues.part_colors import LearnedColors, PartColors, RenderedBody, color_bins
-from tk.model.masks.silhouettes import Pyramid
 from tk.model.setup import Subject
 from tk.model.stateful import Stateful
-from tk.trackers.contour_finder import ContourFinder
-from tk.trackers.initialisation import HEADINGS, PHASES, centroid
+from tk.trackers.contour_finder import ContourFinder, Seen
+from tk.trackers.proposals import anywhere
 from tk.trackers.protocol import Estimate, Frame
 
 Float = NDArray[np.float64]
@@ -26,12 +24,6 @@ S = TypeVar("S")
 
 # As long as a person stays lost, the search from the centroid of the silhouettes runs once in so many frames.
 RECOVER_EVERY = 3
-# Of the poses from which a lost person is searched for at the coarsest scale, one in RECOVERY_KEPT goes on to the finer
-# ones, if its residual is below HALVED times the current one: no finer scale halves a residual.
-RECOVERY_KEPT, HALVED = 4, 2.0
-# A recovered person who faces the other way than before must have a residual (E_S) lower by this at a half turn.
-# Half and twice the value change nothing in dance and cube (60 frames), where nobody is lost for long.
-FACING = 0.04
 # Probability that a ray contradicts the person's own body: the residual (E_S) of the development captures.
 WRONG = 0.1
 
@@ -112,35 +104,12 @@ class ContourTracker(ContourFinder, Stateful[S], ABC):
         """Return masks (V, H, W) after cleaning."""
         return self.views.pyramid(masks, 1, True).masks[0]
 
-    def recover(self, pyramid: Pyramid, pose: Float, residual: float) -> tuple[Float, float]:
-        """Search for a lost person as at the start; return the pose with the lowest residual (E_S), and that residual.
-
-        The given pose, moved to the silhouettes' centroid, is a candidate, too. In one frame a person may face either
-        way: the heading as before is preferred, see :data:`FACING`.
-        """
+    def anywhere(self, seen: Seen, pose: Float) -> Float:
+        """Return proposals (B, D) for a lost person; none if too few cameras see anybody."""
         try:
-            p_centroid = centroid(self.views.rig, pyramid, 0)
+            return anywhere.propose(self, seen, pose)
         except CaptureError:
-            return pose, residual
-        skeleton = self.body.skeleton
-        moved, yaw = pose.copy(), skeleton.index("torso_yaw")
-        moved[skeleton.prismatic] = p_centroid
-        levels = range(self.solver.scales - 1, -1, -1)
-        starts = np.concatenate([moved[None], gait.hypotheses(skeleton, HEADINGS, PHASES, p_centroid, pose[yaw])])
-
-        def turned(states: Float) -> Float:
-            return np.asarray(FACING * (1 - np.cos(states[:, yaw] - pose[yaw])) / 2)
-
-        coarse = self.settle(pyramid, starts, levels[:1]).states
-        rough = self.mean_residual(pyramid, coarse)
-        order = np.argsort(rough + turned(coarse), kind="stable")[: len(starts) // RECOVERY_KEPT]
-        order = order[rough[order] < HALVED * residual]
-        if not len(order):
-            return pose, residual
-        settled = self.settle(pyramid, coarse[order], levels[1:]).states
-        found = self.mean_residual(pyramid, settled)
-        i = int(np.argmin(found + turned(settled)))
-        return (settled[i], float(found[i])) if found[i] < residual else (pose, residual)
+            return np.empty((0, len(pose)))
 
     def pose_fields(self, pose: Float) -> dict[str, Any]:
         """Return the fields of an :class:`~tk.trackers.protocol.Estimate` that follow from a pose (D,)."""

@@ -1,8 +1,9 @@
-"""Poses that are tracked side by side until one of them costs more."""
+"""Poses that are tracked side by side until one of them is improbable."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +12,16 @@ from tk.model.body.skeleton import Skeleton
 
 Float = NDArray[np.float64]
 
+# A hypothesis is dropped if its probability is below 1e-3 of the best one's; nats. The prior of a pose that faces the
+# other way than the person did in the frame before is as low.
+DROPPED = float(np.log(1000.0))
 # Frames during which a hypothesis is tracked beside the best one, and the share of its running cost that a frame
-# replaces. A hypothesis is dropped if its probability is e^-DROPPED of the best one's. Half and twice of each change
-# the mean errors of dance and cube (50 frames) by less than 0.1 cm.
-PATIENCE, RENEWAL, DROPPED = 6, 0.4, 5.0
+# replaces. Half and twice of each change the mean errors of dance and cube (50 frames) by less than 0.1 cm.
+PATIENCE, RENEWAL = 6, 0.4
+# Poses whose joints all differ by less than this, metres, are one; at the start, before the body is fitted.
+SAME_POSE_M, SAME_START_M = 0.05, 0.15
+# Prior of a person who moves forwards rather than backwards, nats, and the way, metres, of which the half shows it.
+FORWARDS, WAY_M = 3.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -36,6 +43,18 @@ class Hypothesis:
     jumped: bool = False
 
 
+class TrajectoryHypothesis(NamedTuple):
+    """Poses that may explain the opening.
+
+    Attributes:
+        poses: (F, D).
+        cost: negative logarithm of their posterior, mean over the frames, nats.
+    """
+
+    poses: Float
+    cost: float
+
+
 def disagreement(skeleton: Skeleton, poses: Float, cost: Float) -> Float:
     """Return (J,) variance of the joints' positions along an axis, metres², over poses (H, D) with costs (H,), nats."""
     weight = np.exp(cost.min() - cost)
@@ -43,3 +62,27 @@ def disagreement(skeleton: Skeleton, poses: Float, cost: Float) -> Float:
     joints = skeleton.joints(poses)
     mean = np.einsum("h,hja->ja", weight, joints)
     return np.asarray(np.einsum("h,hja->j", weight, (joints - mean) ** 2) / 3)
+
+
+def different(skeleton: Skeleton, poses: Float, least_m: float) -> Float:
+    """Return those of the poses (B, D) that differ from all before them by ``least_m`` in a joint, metres."""
+    kept: list[int] = []
+    joints = skeleton.joints(poses)
+    for i in range(len(poses)):
+        if all(np.linalg.norm(joints[i] - joints[k], axis=-1).max() > least_m for k in kept):
+            kept.append(i)
+    return np.asarray(poses[kept])
+
+
+def turning(skeleton: Skeleton, poses: Float, before: Float) -> Float:
+    """Return (B,) the negative logarithm of the prior of the headings of poses (B, D) after a pose (D,), nats."""
+    yaw = skeleton.index("torso_yaw")
+    return np.asarray(DROPPED * (1.0 - np.cos(poses[:, yaw] - before[yaw])) / 2.0)
+
+
+def walking(skeleton: Skeleton, poses: Float) -> Float:
+    """Return (...) the negative logarithm of the prior of trajectories (..., F, D), nats: people walk forwards."""
+    yaw = poses[..., skeleton.index("torso_yaw")]
+    ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)
+    along = (np.diff(poses[..., :2], axis=-2) * (ahead[..., 1:, :] + ahead[..., :-1, :])).sum(axis=-1) / 2.0
+    return np.asarray(-FORWARDS / 2.0 * along.sum(axis=-1) / (np.abs(along).sum(axis=-1) + WAY_M))

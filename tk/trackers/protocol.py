@@ -52,9 +52,6 @@ class Frame:
     landmarks: NDArray[np.float64] | None = None
 
 
-Observation = Frame  # its former name, in modules that are changed at the moment
-
-
 @dataclass(frozen=True)
 class Estimate:
     """A tracker's answer for one frame.
@@ -228,17 +225,23 @@ class TwoPassTracker(Tracker, Protocol):
         """Continue at a pose (D,); forget residuals and hypotheses, keep the body and its colours."""
         ...
 
-    def heading_hypotheses(
-        self, masks: Sequence[NDArray[np.uint8]], poses: Float, height_m: float | None
-    ) -> tuple[TwoPassTracker, ...]:
-        """Return two trackers, whose bodies are fitted to a person with the heading of the poses, and with the opposite
-        one; none if the opposite heading explains the frames clearly worse.
+    def cost(self, masks: Sequence[NDArray[np.uint8]], poses: Float, landmarks: Float | None) -> float:
+        """Return the negative logarithm of the posterior of poses (N, D), median of the frames, nats: a body that does
+        not fit errs in all of them alike.
 
         Args:
             masks: (C, H, W) of N frames, cleaned.
-            poses: (N, D) found in them.
-            height_m: the subject's height, if known.
+            poses: (N, D).
+            landmarks: (N, C, L, 3), NaN where they are unknown; None without any.
         """
+        ...
+
+    def headings(
+        self, masks: Sequence[NDArray[np.uint8]], poses: Float, height_m: float | None, landmarks: Float | None
+    ) -> tuple[TwoPassTracker, ...]:
+        """Return two trackers, whose bodies are fitted to a person with the heading of the poses, and with the opposite
+        one; none if the opposite heading is improbable (1e-3). Arguments as for :meth:`cost`, and the subject's height
+        if known."""
         ...
 
     def turned_pose(self, pose: Float) -> Float:

@@ -32,7 +32,7 @@ from tk.model.body.limb_candidates import Limb, turned
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import determine_depth
-from tk.model.cues.landmarks import contradiction, propose
+from tk.model.cues.landmarks import contradiction
 from tk.model.cues.part_colors import LearnedColors, color_bins
 from tk.model.cues.ray_costs import Evidence
 from tk.model.cues.visible_contours import contour_shares
@@ -43,11 +43,12 @@ from tk.model.setup import Setup, Subject
 from tk.optim.gauss_newton import GaussNewtonSettings
 from tk.optim.quadratic import Quadratic
 from tk.settings import RegionSettings, Settings, SilhouetteSettings
-from tk.trackers.contour_finder import INFORMATION
+from tk.trackers.contour_finder import INFORMATION, Seen
 from tk.trackers.contour_tracker import RECOVER_EVERY, ContourTracker
-from tk.trackers.hypotheses import DROPPED, PATIENCE, RENEWAL, Hypothesis, disagreement
-from tk.trackers.limb_search import SAME_POSE_M
-from tk.trackers.protocol import Estimate, Observation, Stopwatch
+from tk.trackers.hypotheses import DROPPED, PATIENCE, RENEWAL, SAME_POSE_M, Hypothesis, disagreement, walking
+from tk.trackers.proposals import exchanged, limbs
+from tk.trackers.proposals import landmarks as of_landmarks
+from tk.trackers.protocol import Estimate, Frame, Stopwatch
 from tk.trackers.residual import BaselineState, ResidualBaseline, variance_factor
 from tk.trackers.second_pass import STATURE, SecondPass
 
@@ -68,10 +69,6 @@ PLAIN = 0.25
 # development captures; half and twice the value change the mean errors of dance and cube (50 frames) by 0.04 cm at
 # most (angle) and 0.01 cm (translation).
 ANGLE_DEG, TRANSLATION_M = 40.0, 0.3
-# If the opposite heading has less than this multiple of the residual, the person is tracked with both. Of walk, dance,
-# fold, cube, punch and kick with all, three and two cameras it is 1.67 to 2.4 in the median of 20 frames; of small
-# pictures of a walk of 14 frames 1.21; of a person with poor masks 1.05, and 1.00 or less if back was taken for front.
-AMBIGUOUS_HEADING = 1.15
 # After this many consecutive frames with a high residual, and two failed searches for the person, sigma is set to NaN.
 UNKNOWN_AFTER = 2 * RECOVER_EVERY
 # Masks are searched for carried objects if this share of their pixels has colours that are not the person's; objects
@@ -113,7 +110,6 @@ class RegionState:
         mean_posture, postures: (J, 3) mean directions, of this number of frames.
         lost_for, high_for: consecutive frames in which the person was lost, and with a high residual.
         view_m: see :class:`RegionTracker`.
-        heading_known: whether landmarks have shown it.
         fresh: whether no frame has been tracked yet.
     """
 
@@ -125,7 +121,6 @@ class RegionState:
     lost_for: int
     high_for: int
     view_m: float
-    heading_known: bool
     fresh: bool
 
 
@@ -164,7 +159,6 @@ class RegionTracker(ContourTracker[RegionState]):
         self._mean_posture: Float = np.zeros((len(JOINTS), 3))
         self._postures = 0
         self._fresh = True
-        self._heading_known = False
         self.view_m = VIEW_M
         self._reset()
 
@@ -173,7 +167,7 @@ class RegionTracker(ContourTracker[RegionState]):
         self.residuals = ResidualBaseline(len(self.rig), self.config.false_alarm)
         self._lost_for = self._high_for = 0
 
-    def start(self, frames: Sequence[Observation], subject: Subject) -> None:
+    def start(self, frames: Sequence[Frame], subject: Subject) -> None:
         pose = self.find(frames, subject)
         self._alive = [Hypothesis(pose, pose, 0.0)]
         self._mean_posture, self._postures = np.zeros((len(JOINTS), 3)), 0
@@ -192,40 +186,54 @@ class RegionTracker(ContourTracker[RegionState]):
         inside = turned(self.world.poses_in(pose[None])[0], self.limbs)
         return np.asarray(self.world.poses_out(inside[None])[0])
 
-    def heading_hypotheses(
-        self, masks: Sequence[NDArray[np.uint8]], poses: Float, height_m: float | None
+    def cost(self, masks: Sequence[NDArray[np.uint8]], poses: Float, landmarks: Float | None) -> float:
+        """See :class:`~tk.trackers.protocol.TwoPassTracker`."""
+        inside = self.world.poses_in(poses)
+        seen = self._pyramids(masks, landmarks)
+        cost = np.median([self.score(pyramid, pose[None])[0] for pyramid, pose in zip(seen, inside, strict=True)])
+        return float(cost + walking(self.body.skeleton, inside))
+
+    def _pyramids(self, masks: Sequence[NDArray[np.uint8]], landmarks: Float | None) -> list[Pyramid]:
+        """Return the silhouettes and landmarks of frames, arguments as for :meth:`cost`."""
+        known = [None] * len(masks) if landmarks is None else [x if np.isfinite(x).any() else None for x in landmarks]
+        return [self.views.pyramid(m, self.solver.scales, False, x) for m, x in zip(masks, known, strict=True)]
+
+    def headings(
+        self, masks: Sequence[NDArray[np.uint8]], poses: Float, height_m: float | None, landmarks: Float | None
     ) -> tuple[RegionTracker, ...]:
         """See :class:`~tk.trackers.protocol.TwoPassTracker`."""
-        if self._heading_known:
-            return ()
-        seen = [self.views.pyramid(shown, self.solver.scales, False) for shown in masks]
+        seen, inside = self._pyramids(masks, landmarks), self.world.poses_in(poses)
         both = np.array([
             self.settle(pyramid, np.stack([pose, turned(pose, self.limbs)])).states
-            for pyramid, pose in zip(seen, self.world.poses_in(poses), strict=True)
+            for pyramid, pose in zip(seen, inside, strict=True)
         ])  # fmt: skip
-        residual = np.array([self.mean_residual(pyramid, two) for pyramid, two in zip(seen, both, strict=True)])
-        if not np.median(residual[:, 1] / residual[:, 0]) < AMBIGUOUS_HEADING:
-            return ()
+        for i, (shown, pyramid) in enumerate(zip(masks, seen, strict=True)):
+            frame = Frame(i, np.empty((len(shown), 0, 0, 3), np.uint8), shown)
+            both[i, 1] = self.improved(self.see(frame, pyramid=pyramid), both[i, 1])
         stature = height_m or self.body.dimensions.stature
         deviation = STATURE_DEVIATION if height_m else STATURE
-        trackers = self.with_cameras(self.rig), self.with_cameras(self.rig)
-        for tracker, fitted in zip(trackers, both.swapaxes(0, 1), strict=True):
-            tracker.take_body(self.fit(seen, fitted, np.arange(len(seen)), stature, deviation)[0])
-        return trackers
+        trackers, costs = (self.with_cameras(self.rig), self.with_cameras(self.rig)), []
+        for tracker, one in zip(trackers, both.swapaxes(0, 1), strict=True):
+            body, fitted = self.fit(seen, one, np.arange(len(seen)), stature, deviation)
+            tracker.take_body(body)
+            costs.append(tracker.cost(masks, self.world.poses_out(fitted), landmarks))
+        return trackers if costs[1] < costs[0] + DROPPED else ()
 
-    def step(self, frame: Observation) -> Estimate:
+    def step(self, frame: Frame) -> Estimate:
         watch = Stopwatch()
         contours, config = self.contours, self.config
         frame = self.without_foreign(frame)
-        pyramid = self.pyramid(frame)
-        images = frame.images if config.colors else None
+        seen = self.see(frame, frame.images if config.colors else None)
+        pyramid, evidence = seen.pyramid, seen.evidence
         watch.lap("masks_clean")
+        # predict, settle
         self._alive += [replace(h, previous=h.pose, jumped=False) for h in self._alive if h.jumped]
         starts = np.array([h.pose + contours.prediction * (h.pose - h.previous) for h in self._alive])
         levels, solver = self._iterations()
-        poses, hessian, iterations = self.settle(pyramid, starts, levels, images, self.prior(starts), solver=solver)
+        poses, hessian, iterations = self.settle(
+            pyramid, starts, levels, seen.images, self.prior(starts), solver=solver
+        )
         watch.lap("optimise")
-        evidence = self.evidence(self.screen, frame, pyramid)
         cost, met = evidence.cast(self.body, poses)
         if not np.isfinite(cost).all():
             return self._nobody(frame, watch)
@@ -238,20 +246,19 @@ class RegionTracker(ContourTracker[RegionState]):
         i = int(np.argmin([np.abs(pose - self._best.pose).max() for pose in poses]))
         look = _Look(met.label[i], hessian[i], evidence.residual(met.label[i]))
         watch.lap("check")
+        # propose, settle, choose: the person anywhere, then the limbs
         cut = not self._lost_for and self.residuals.jumped(look.residual)
-        if cut and self._find_again(pyramid, look.error):
-            look = self._look(evidence, pyramid, images)
+        if (cut or self._is_due(look.error)) and self._choose(seen, self.anywhere(seen, self._best.pose), again=True):
+            look = self._look(seen)
         misplaced = self.misplaced(evidence, look.label)
         searched = self._needs_search(frame, look, misplaced, evidence.hidden(look.label))
-        settled = self._best.pose
-        self._propose(frame, pyramid, evidence, images, misplaced if searched else None)
-        if self._best.pose is not settled:
-            look = self._look(evidence, pyramid, images)
+        best, proposed = self._best.pose, [of_landmarks.propose(self, seen)]
+        if searched:
+            proposed += [limbs.propose(self, seen, best, misplaced), exchanged.propose(self, seen, best)]
+        if self._choose(seen, *proposed):
+            look = self._look(seen)
         watch.lap("search")
-        followed = self._best.pose
-        lost = self._recover(pyramid, look.error)
-        if self._best.pose is not followed:
-            look = self._look(evidence, pyramid, images)
+        lost = float(np.nanmean(look.error)) > contours.lost_error
         lost |= self._lost_for < UNKNOWN_AFTER and self.residuals.jumped(look.residual)
         self._learn(evidence, look, lost)
         again = cut or self._lost_for > 0
@@ -276,7 +283,7 @@ class RegionTracker(ContourTracker[RegionState]):
             landmarks=pyramid.landmarks,
         )
 
-    def without_foreign(self, frame: Observation) -> Observation:
+    def without_foreign(self, frame: Frame) -> Frame:
         """Return the frame with masks that exclude carried objects: large areas of colours that are not the person's.
 
         Their pixels become uncertain, because parts of the body may be in front of or behind them.
@@ -371,7 +378,7 @@ class RegionTracker(ContourTracker[RegionState]):
             limb for limb in self.limbs if cost[limb.parts].sum() > MISPLACED * max(count[limb.parts].sum(), 1)
         )
 
-    def _needs_search(self, frame: Observation, look: _Look, misplaced: Sequence[Limb], hidden: float) -> bool:
+    def _needs_search(self, frame: Frame, look: _Look, misplaced: Sequence[Limb], hidden: float) -> bool:
         """Return whether the limbs are searched for: at intervals, if the residual is high, a limb is misplaced, or the
         share ``hidden`` of the body meets pixels of other people and the frame shows what the pose does not explain."""
         if misplaced or self.residuals.high(look.error):
@@ -380,54 +387,30 @@ class RegionTracker(ContourTracker[RegionState]):
         doubtful = hidden > HIDDEN and self.residuals.mean_excess(look.error) > UNEXPLAINED
         return every > 0 and (frame.index % every == 0 or (doubtful and frame.index % SEARCH_HIDDEN == 0))
 
-    def _propose(
-        self,
-        frame: Observation,
-        pyramid: Pyramid,
-        evidence: Evidence,
-        images: NDArray[np.uint8] | None,
-        misplaced: Sequence[Limb] | None,
-    ) -> None:
-        """Add the pose of the landmarks, and those of a limb search, to the hypotheses, with their cost relative to the
-        best one's running mean. ``misplaced``: see :meth:`search`; None: limbs are not searched for."""
-        best, further = self._best, np.empty((0, len(self._best.pose)))
-        if pyramid.landmarks is not None:
-            self._heading_known = True
-            further = propose(self.views.rig, self.body.skeleton, pyramid.landmarks)
-        if misplaced is None and not len(further):
-            return
-        poses, cost = self.search(frame, pyramid, evidence, best.pose, images, misplaced, further)
-        gain = cost[0] - cost
-        self._alive += [
-            Hypothesis(pose, best.previous, best.cost - RENEWAL * float(g), jumped=True)
-            for pose, g in zip(poses[1:], gain[1:], strict=True)
-            if g > -DROPPED / 2
-        ]
-        self._rank()
+    def _choose(self, seen: Seen, *proposed: Float, again: bool = False) -> bool:
+        """Add proposed poses (B, D) to the hypotheses, with their cost relative to the best one's running mean; return
+        whether one of them is now the best. ``again``: the displacement from the last pose is no motion."""
+        best = self._best
+        if any(map(len, proposed)):
+            poses, cost = self.compared(seen, best.pose, *proposed)
+            self._alive += [
+                Hypothesis(pose, pose if again else best.previous, best.cost + RENEWAL * float(more), jumped=not again)
+                for pose, more in zip(poses[1:], cost[1:] - cost[0], strict=True)
+                if more < DROPPED
+            ]
+            self._rank()
+        return not np.array_equal(self._best.pose, best.pose)
 
-    def _recover(self, pyramid: Pyramid, by_view: Float) -> bool:
-        """Return whether the person is lost; if so, or if the residual (E_S, (V,)) stays high, search for the person
-        as at the start. Searches for the second reason become rarer: after 3, 6, 12 … frames."""
+    def _is_due(self, by_view: Float) -> bool:
+        """Return whether the person is searched for as at the start, because the last frame was lost, or the residual
+        (E_S, (V,)) is above the limit or stays high. Searches for the last reason become rarer: after 3, 6, 12 …
+        frames; of a lost person they are in every third frame."""
         error, limit = float(np.nanmean(by_view)), self.contours.lost_error
         self._high_for = self._high_for + 1 if self.residuals.high(by_view) else 0
-        due = self._lost_for > 0 if error <= limit else self._lost_for % RECOVER_EVERY == 0
         waits, rest = divmod(self._high_for, RECOVER_EVERY)
-        stays_high = not due and rest == 0 and waits.bit_count() == 1
-        if not (due or stays_high):
-            return error > limit
-        pose, found = self.recover(pyramid, self._best.pose, error)
-        if found < (error - self.residuals.margin if stays_high else error):
-            self._alive = [Hypothesis(pose, pose, self._best.cost)]
-        return found > limit
-
-    def _find_again(self, pyramid: Pyramid, by_view: Float) -> bool:
-        """Search for the person as at the start, because E_S (V,) has jumped in all views; return whether a better pose
-        was found."""
-        pose, _ = self.recover(pyramid, self._best.pose, float(np.nanmean(by_view)))
-        if pose is self._best.pose:
-            return False
-        self._alive = [Hypothesis(pose, pose, self._best.cost)]
-        return True
+        if rest == 0 and waits.bit_count() == 1:
+            return True
+        return self._lost_for > 0 if error <= limit else self._lost_for % RECOVER_EVERY == 0
 
     def _learn(self, evidence: Evidence, look: _Look, lost: bool) -> None:
         """Update the baseline of the residual; the colours, too, if E_S is not above the baseline."""
@@ -437,13 +420,13 @@ class RegionTracker(ContourTracker[RegionState]):
             self.colors.learn(evidence.bins[evidence.person], look.label[evidence.person])
         self.residuals.learn(look.error)
 
-    def _look(self, evidence: Evidence, pyramid: Pyramid, images: NDArray[np.uint8] | None) -> _Look:
+    def _look(self, seen: Seen) -> _Look:
         """Return how the best pose explains the frame."""
         best = self._best.pose[None]
-        _, met = evidence.cast(self.body, best)
-        regions = None if images is None else self.colors.regions(images)
-        here = normal_equations(self.body.arrays, self.views.at(pyramid, 0), best, self.line_search, regions)
-        return _Look(met.label[0], here.hessian[0], evidence.residual(met.label[0]))
+        _, met = seen.evidence.cast(self.body, best)
+        regions = None if seen.images is None else self.colors.regions(seen.images)
+        here = normal_equations(self.body.arrays, self.views.at(seen.pyramid, 0), best, self.line_search, regions)
+        return _Look(met.label[0], here.hessian[0], seen.evidence.residual(met.label[0]))
 
     def _sigma(self, pose: Float, look: _Look, landmarks: Float | None) -> Float:
         """Return (J,) one standard deviation of each joint's position along an axis, metres: from the evidence of this
@@ -508,7 +491,7 @@ class RegionTracker(ContourTracker[RegionState]):
         again.decide()
         return np.where(lost[:, None], poses, self.world.poses_out(again.poses)), again.residual, again.sigma
 
-    def _nobody(self, frame: Observation, watch: Stopwatch) -> Estimate:
+    def _nobody(self, frame: Frame, watch: Stopwatch) -> Estimate:
         """Return the estimate of a frame without a person: the last pose, lost."""
         self._lost_for += 1
         pose = self._best.pose

@@ -143,11 +143,6 @@ class ResidualBaseline(Stateful[BaselineState]):
         seen = np.isfinite(excess)
         return bool(seen.any() and (excess[seen] > OUTLIER).all())
 
-    @property
-    def margin(self) -> float:
-        """The rise of E_S above the baseline, mean over the views, that counts as high."""
-        return float(self.threshold * self.spread.mean())
-
     def learn(self, error: Float) -> None:
         """Update the baseline with a frame's E_S (V,). It counts as one spread above the mean at most, so that a wrong
         pose does not become the baseline soon."""

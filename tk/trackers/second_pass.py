@@ -32,8 +32,7 @@ from tk.model.body.skeleton import JOINTS
 from tk.model.cues.landmarks import contradiction
 from tk.model.cues.ray_costs import residual_of
 from tk.model.masks.silhouettes import Pyramid
-from tk.trackers.hypotheses import DROPPED, RENEWAL
-from tk.trackers.limb_search import SAME_POSE_M
+from tk.trackers.hypotheses import DROPPED, RENEWAL, SAME_POSE_M
 
 if TYPE_CHECKING:
     from tk.trackers.region import RegionTracker

@@ -11,7 +11,7 @@ or behind the trunk, and when the arm reappears, no contour may be near it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from tk.model.cameras.camera import Rig
 from tk.model.setup import Setup, Subject
 from tk.optim.gauss_newton import GaussNewtonSettings
 from tk.settings import Settings, SilhouetteSettings
-from tk.trackers.contour_finder import LINE_SEARCH, SOLVER
+from tk.trackers.contour_finder import LINE_SEARCH, SOLVER, blind
 from tk.trackers.contour_tracker import RECOVER_EVERY, ContourTracker
 from tk.trackers.protocol import Estimate, Frame, Stopwatch
 
@@ -68,26 +68,28 @@ class SilhouetteTracker(ContourTracker[SilhouetteState]):
         self._fresh = True
 
     def start(self, frames: Sequence[Frame], subject: Subject) -> None:
-        self._pose = self._previous = self.find([_blind(f) for f in frames], subject)
+        self._pose = self._previous = self.find([blind(f) for f in frames], subject)
         self._lost_for = 0
         self._fresh = True
 
     def step(self, frame: Frame) -> Estimate:
         watch = Stopwatch()
         config = self.contours
-        pyramid = self.pyramid(frame)
+        seen = self.see(blind(frame))
+        pyramid = seen.pyramid
         watch.lap("masks_clean")
         start = self._pose + config.prediction * (self._pose - self._previous)
         settled = self.settle(pyramid, start[None])
         pose = settled.states[0]
         watch.lap("optimise")
         if self.search_frames and frame.index % self.search_frames == 0:
-            pose = self.improved(_blind(frame), pyramid, pose)
+            pose = self.improved(seen, pose)
         error = float(self.mean_residual(pyramid, pose[None], frame.uncertain)[0])
         # after a loss a pose near the last one may fit by chance
         due = self._lost_for > 0 if error <= config.lost_error else self._lost_for % RECOVER_EVERY == 0
         if due and np.isfinite(error):
-            pose, error = self.recover(pyramid, pose, error)
+            pose = self.best(seen, pose, self.anywhere(seen, pose))
+            error = float(self.mean_residual(pyramid, pose[None], frame.uncertain)[0])
         lost = not error <= config.lost_error
         status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
         # nobody is visible: the last pose is kept
@@ -107,8 +109,3 @@ class SilhouetteTracker(ContourTracker[SilhouetteState]):
 
     def last_poses(self) -> tuple[Float, Float]:
         return self._pose, self._previous
-
-
-def _blind(frame: Frame) -> Frame:
-    """Return the frame without images: this tracker does not use colours."""
-    return replace(frame, images=frame.images[:0])

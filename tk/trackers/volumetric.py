@@ -41,6 +41,7 @@ from tk.optim import schedule
 from tk.optim.smd import MAX_ITERATIONS
 from tk.settings import Settings
 from tk.trackers.contour_finder import ContourFinder
+from tk.trackers.proposals import exchanged, limbs
 from tk.trackers.protocol import Estimate, Frame, Stopwatch
 
 Float = NDArray[np.float64]
@@ -224,10 +225,10 @@ class VolumetricTracker(Stateful[VolumetricState]):
         """
         finder = self._finder
         # without images: colours inside the silhouettes are a cue of the region tracker only
-        blind = Frame(frame.index, frame.images[:0], frame.masks, frame.uncertain)
-        pyramid = finder.pyramid(blind)
-        converged = finder.settle(pyramid, self._to_contours(found.pose)[None]).states[0]
-        candidates, _ = finder.search(blind, pyramid, finder.evidence(finder.screen, blind, pyramid), converged)
+        seen = finder.see(Frame(frame.index, frame.images[:0], frame.masks, frame.uncertain))
+        converged = finder.settle(seen.pyramid, self._to_contours(found.pose)[None]).states[0]
+        proposed = limbs.propose(finder, seen, converged), exchanged.propose(finder, seen, converged)
+        candidates, _ = finder.compared(seen, converged, *proposed)
         starts = problem.constrain(np.array([self._from_contours(candidate) for candidate in candidates]))
         values = problem.values(starts)
         best, here = int(np.argmin(values)), problem.value(found.pose)
