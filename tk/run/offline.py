@@ -228,10 +228,17 @@ class _Finisher:
             return tracker
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, HEADING_FRAMES).round().astype(int))]
         poses, unused = draft.current("pose"), np.isnan(draft.current("residual")[..., 0])
-        shown = [np.where(unused[row][:, None, None], 0, masks.get(int(draft.result.frames[row]))) for row in rows]
         landmarks = self._landmarks(draft, self._late)
-        seen = None if landmarks is None else np.where(unused[rows][:, :, None, None], np.nan, landmarks[rows])
-        hypotheses = tracker.headings(shown, poses[rows], height_m, seen)
+
+        def seen(rows: NDArray[np.int64]) -> tuple[list[NDArray[np.uint8]], Float | None]:
+            """Return the masks and landmarks of frames by the cameras that were used."""
+            shown = [np.where(unused[row][:, None, None], 0, masks.get(int(draft.result.frames[row]))) for row in rows]
+            return shown, None if landmarks is None else np.where(
+                unused[rows][..., None, None], np.nan, landmarks[rows]
+            )
+
+        shown, marked = seen(rows)
+        hypotheses = tracker.headings(shown, poses[rows], height_m, marked)
         if not hypotheses:
             return tracker
         _LOG.info("tracking with both headings: which way the person faces is unclear")
@@ -239,17 +246,20 @@ class _Finisher:
         for hypothesis, pose in zip(hypotheses, (start, tracker.turned_pose(start)), strict=True):
             hypothesis.start_at(pose)
         drafts, costs = self._tracked_by(hypotheses, draft, unused), []
+        both = np.flatnonzero(~(drafts[0].lost | drafts[1].lost))
+        shown, marked = seen(both)
         for hypothesis, one in zip(hypotheses, drafts, strict=True):
             first = one.current("pose"), one.lost, one.current("residual")
             again = hypothesis.second_pass(
                 masks.sequence(draft.result.frames), *first, height_m, landmarks, True, self.within
             )
-            costs.append(hypothesis.cost(shown, again[0][rows], seen))
-        if costs[0] <= costs[1]:
-            return tracker
-        draft.lost, draft.columns = drafts[1].lost, drafts[1].columns
+            costs.append(hypothesis.cost(shown, again[0][both], marked))
+        best, yaw = int(costs[1] < costs[0]), tracker.body.skeleton.index("torso_yaw")
+        if np.median(np.cos(drafts[best].current("pose")[both, yaw] - poses[both, yaw])) > 0:
+            return tracker  # either tracker may have found the other heading by itself
+        draft.lost, draft.columns = drafts[best].lost, drafts[best].columns
         self.note("the person faces the other way than the first frames seemed to show: tracked again")
-        return hypotheses[1]
+        return hypotheses[best]
 
     def _tracked_by(self, trackers: Sequence[TwoPassTracker], draft: _Draft, unused: NDArray[np.bool_]) -> list[_Draft]:
         """Track the frames of a draft by trackers that have been started, side by side, without the cameras (F, C) that

@@ -226,7 +226,7 @@ class TwoPassTracker(Tracker, Protocol):
         ...
 
     def cost(self, masks: Sequence[NDArray[np.uint8]], poses: Float, landmarks: Float | None) -> float:
-        """Return the negative logarithm of the posterior of poses (N, D), median of the frames, nats: a body that does
+        """Return the negative logarithm of the posterior of poses (N, D), mean over the frames, nats: a body that does
         not fit errs in all of them alike.
 
         Args:

@@ -190,7 +190,7 @@ class RegionTracker(ContourTracker[RegionState]):
         """See :class:`~tk.trackers.protocol.TwoPassTracker`."""
         inside = self.world.poses_in(poses)
         seen = self._pyramids(masks, landmarks)
-        cost = np.median([self.score(pyramid, pose[None])[0] for pyramid, pose in zip(seen, inside, strict=True)])
+        cost = np.mean([self.score(pyramid, pose[None])[0] for pyramid, pose in zip(seen, inside, strict=True)])
         return float(cost + walking(self.body.skeleton, inside))
 
     def _pyramids(self, masks: Sequence[NDArray[np.uint8]], landmarks: Float | None) -> list[Pyramid]:
