@@ -138,13 +138,16 @@ def texture(board: Board) -> NDArray[np.float32]:
 class BoardCamera:
     """Renders one camera's images of a board."""
 
-    def __init__(self, camera: Camera, board: Board, sensor: Sensor, room: bool = True) -> None:
+    def __init__(self, camera: Camera, board: Board, sensor: Sensor, room: Float | bool = True) -> None:
+        """``room``: whether the generated room is behind the board; or a picture of one (H, W, 3), linear RGB."""
         self.camera, self.board, self.sensor = camera, board, sensor
         self._texture = texture(board)
         y, x = np.mgrid[: camera.height, : camera.width]
         grid = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
         self._rays = camera.rays(grid).reshape(camera.height, camera.width, 3)
-        if room:
+        if isinstance(room, np.ndarray):
+            self._background = room.astype(np.float32)
+        elif room:
             lamps = make_lamps(np.array([-1.5, -1.5, 0.0]), np.array([1.5, 1.5, 2.2]))
             view = view_room(camera, lamps, 2)
             self._background = (view.indirect + view.direct.sum(axis=0)).astype(np.float32)

@@ -67,7 +67,9 @@ def read_people(path: str | os.PathLike[str]) -> tuple[JointTrack, ...]:
     """
     path = Path(path)
     with open_hdf5(path) as file:
-        if file.attribute("", "format") is None:
+        version = file.attribute("", "format_version")
+        older = file.is_format(FORMAT) and isinstance(version, int | np.integer) and version < FORMAT_VERSION
+        if older or file.attribute("", "format") is None:  # joints have the same place in every version
             units = file.text("", "units", "m")
             if units != "m":
                 file.fail(f"units = {units}; joint positions must be in metres (m)")
