@@ -204,14 +204,13 @@ class PeopleMasks:
         """Where the landmarks show somebody else than in the other cameras, give the segmenter the square around the
         points that most cameras agree on: people who stand close together are sighted as one."""
         known = np.isfinite(person.landmarks[..., 0]).any(axis=1)
-        agree, points = consensus(self._rig, person.landmarks)
+        agree, points, _ = consensus(self._rig, person.landmarks)
         points = points[np.isfinite(points).all(axis=1)]
         for c in np.flatnonzero(known & ~agree).tolist() if agree.any() else ():
             pixels, _ = self._rig[c].project(points)
             pixels = pixels[np.isfinite(pixels).all(axis=1)]
             if len(pixels) > 1:
-                person.patches[c] = Patch.about(pixels, _HULL_MARGIN, person.patches[c].angle)
-                self._segment(images, c, person)
+                self._ask_again(images, c, person, Patch.about(pixels, _HULL_MARGIN, person.patches[c].angle))
 
     def _compare(self, images: Images, person: _Person) -> None:
         """Compare each mask with the hull of the others; where it shows somebody else, or the square fits badly, the
@@ -224,8 +223,7 @@ class PeopleMasks:
             better = Patch.about(expected, _HULL_MARGIN, patch.angle)
             missed = self._hull.share(others, c, person.masks[c]) < _LEAST_SHARE
             if missed or patch.side > _TOO_LARGE * better.side or not patch.holds(expected):
-                person.patches[c] = better
-                self._segment(images, c, person)
+                self._ask_again(images, c, person, better)
 
     def _new_views(self, person: _Person, people: Sequence[_Person]) -> Bool:
         """Return (C,) whether a camera shows enough of a person that nobody else's mask shows."""
@@ -248,7 +246,9 @@ class PeopleMasks:
                 for other, masks in zip(people, first, strict=True):
                     if other is not person:
                         self._paint(painted, c, masks[c], other.patches[c])
-                found, person.landmarks[c] = self._seen(painted, c, person.patches[c])
+                found, landmarks = self._seen(painted, c, person.patches[c])
+                if not self._take(person, c, landmarks):
+                    continue
                 near = self._hull.near(self._hull.subject(person.masks, but=c), c, images.shape[1:3])
                 person.uncertain[c] |= (found > _UNCERTAIN) & near
                 person.masks[c][(found > 0.5) & near] = 255
@@ -265,9 +265,31 @@ class PeopleMasks:
         landmarks = np.full((len(self._rig), len(LANDMARKS), 3), np.nan)
         return _Person(list(patches), np.zeros(shape, np.uint8), np.zeros(shape, np.bool_), landmarks, number)
 
+    def _ask_again(self, images: Images, c: int, person: _Person, patch: Patch) -> None:
+        """Give the segmenter another square of a person in an image."""
+        found, landmarks = self._seen(images[c], c, patch)
+        if self._take(person, c, landmarks):
+            person.patches[c] = patch
+            self._put(person, c, found)
+
+    def _take(self, person: _Person, c: int, landmarks: NDArray[np.float64]) -> bool:
+        """Replace a person's landmarks in an image, unless fewer cameras then agree on them: the network shows somebody
+        else. Return whether they were replaced."""
+        before, earlier = consensus(self._rig, person.landmarks).support, person.landmarks[c].copy()
+        person.landmarks[c] = landmarks
+        if consensus(self._rig, person.landmarks).support < before:
+            person.landmarks[c] = earlier
+            return False
+        return True
+
     def _segment(self, images: Images, c: int, person: _Person) -> None:
         """Give the segmenter the square of a person in an image; replace the mask and the landmarks."""
         found, person.landmarks[c] = self._seen(images[c], c, person.patches[c])
+        self._put(person, c, found)
+
+    @staticmethod
+    def _put(person: _Person, c: int, found: NDArray[np.float32]) -> None:
+        """Replace a person's mask in an image by the probabilities (H, W)."""
         person.masks[c] = np.where(found > 0.5, 255, 0)
         person.uncertain[c] = (found > _UNCERTAIN) & (found <= 0.5)
 

@@ -61,7 +61,7 @@ def test_cameras_with_fewer_than_two_others_have_no_evidence() -> None:
 
 def test_ratio_falls_with_the_distance_and_is_bounded() -> None:
     visible = np.full(21, 0.95)
-    ratios = [log_ratio(np.full(21, metres), visible) for metres in (0.0, 0.03, 0.1, 0.5, 5.0)]
+    ratios = [log_ratio(np.full((21, 2), [metres, 0.0]), visible) for metres in (0.0, 0.03, 0.1, 0.5, 5.0)]
     assert ratios == sorted(ratios, reverse=True) and ratios[1] > 0 > ratios[3]
     assert ratios[3] - ratios[4] < 0.1 and np.isfinite(ratios[4])
 
@@ -120,7 +120,7 @@ def test_people_sighted_as_one_are_told_apart_by_most_cameras() -> None:
     one, other = (landmarks_of(RIG, BODY, pose, 0.02, seed=k) for k, pose in enumerate((POSES[0], apart)))
     mixed = one.copy()
     mixed[2] = other[2]
-    agree, points = consensus(RIG, mixed)
+    agree, points, _ = consensus(RIG, mixed)
     assert agree.tolist() == [True, True, False, True]
     assert np.nanmedian(np.linalg.norm(points - body_points(BODY, POSES[0]), axis=1)) < 0.05
     assert consensus(RIG, one)[0].all()
@@ -129,5 +129,5 @@ def test_people_sighted_as_one_are_told_apart_by_most_cameras() -> None:
 def test_no_camera_agrees_without_a_pair_that_shows_one_person() -> None:
     alone = np.full((4, 21, 3), np.nan)
     alone[1] = landmarks_of(RIG, BODY, POSES[0], 0.02)[1]
-    agree, points = consensus(RIG, alone)
+    agree, points, _ = consensus(RIG, alone)
     assert not agree.any() and np.isnan(points).all()

@@ -182,13 +182,28 @@ class LandmarkCue:
         return np.log(both / WRONG_DENSITY), inside / both, r, np.broadcast_to(sigma, both.shape)
 
 
-def log_ratio(distance_m: Float, visibility: Float) -> float:
-    """Return the logarithm of the likelihood of landmarks (N,) at distances from where they should be, against that of
-    wrong ones, nats."""
-    sigma = np.hypot(SEEN_M, OFFSET_M) * HIDDEN ** (1.0 - visibility)
+def deviation(visibility: Float) -> Float:
+    """Return the standard deviation of landmarks about the body's points, metres, by their visibility."""
+    return np.asarray(np.hypot(SEEN_M, OFFSET_M) * HIDDEN ** (1.0 - visibility))
+
+
+def log_ratio(away_m: Float, visibility: Float, spread: Float | None = None) -> float:
+    """Return the logarithm of the likelihood of landmarks (N,) that are right, against that of wrong ones, nats.
+
+    Args:
+        away_m: (N, 2) metres from where they should be, across the view.
+        visibility: (N,).
+        spread: (N, 2, 2) covariance of where they should be; None: it is known. What is open to a right landmark is
+            open to a wrong one, too, so an unknown place gives a ratio near 0.
+    """
     right = RIGHT_HIDDEN + (RIGHT_SEEN - RIGHT_HIDDEN) * visibility
-    inside = right / (2 * np.pi * sigma**2) * np.exp(-0.5 * (distance_m / sigma) ** 2)
-    return float(INDEPENDENT * np.log(inside / WRONG_DENSITY + 1.0 - right).sum())
+    covariance = deviation(visibility)[:, None, None] ** 2 * np.eye(2) + (0.0 if spread is None else spread)
+    finite = np.asarray(np.isfinite(away_m).all(axis=1))
+    away = np.where(finite[:, None], away_m, 0.0)
+    square = np.where(finite, (away * np.linalg.solve(covariance, away[..., None])[..., 0]).sum(axis=1), np.inf)
+    wide = covariance + np.eye(2) / (2 * np.pi * WRONG_DENSITY)
+    ratio = np.sqrt(np.linalg.det(wide) / np.linalg.det(covariance)) * np.exp(-0.5 * square)
+    return float(INDEPENDENT * np.log(right * ratio + 1.0 - right).sum())
 
 
 def _normalised(rig: Rig, landmarks: Float) -> Float:
