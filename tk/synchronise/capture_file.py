@@ -36,7 +36,8 @@ def common_span(recordings: Sequence[Recording], clocks: Clocks) -> tuple[float,
         rest = [k for k in range(len(recordings)) if k != c]
         raise CaptureError(
             f"{recordings[c].where}: has no time in common with the others: it shows {begins[c]:.1f} s to "
-            f"{ends[c]:.1f} s, they {begins[rest].max():.1f} s to {ends[rest].min():.1f} s; leave it out, with --cameras"
+            f"{ends[c]:.1f} s, they {begins[rest].max():.1f} s to {ends[rest].min():.1f} s; leave it out with "
+            "--cameras"
         )
     return begin, end
 

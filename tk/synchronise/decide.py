@@ -86,9 +86,9 @@ def decide(recordings: Sequence[Recording], ties: Sequence[Tie], reasons: dict[i
         used = [*certain, *by_kind["timecode"]]
         notes.append("timecode alone gives the offsets of some cameras; nothing checks it, so look at sync.png")
     clocks = solve(count, used)
-    dropped = {}
+    dropped: dict[str, list[str]] = {}
     for i, j, kind in clocks.dropped:
-        dropped.setdefault((kind), []).append(f"{recordings[i].name} and {recordings[j].name}")
+        dropped.setdefault(kind, []).append(f"{recordings[i].name} and {recordings[j].name}")
     for kind, pairs in dropped.items():
         notes.append(f"{SHOWN.get(kind, kind)} of {', '.join(pairs)} contradicts the other pairs, and is not used")
     for c in np.flatnonzero(~clocks.connected).tolist():

@@ -84,7 +84,7 @@ def _outlined(image: Float | NDArray[np.float32], still: NDArray[np.float32]) ->
     difference = image - still
     difference = difference - np.median(difference)
     mask = (cv2.GaussianBlur(np.abs(difference), (0, 0), 1.0) > _DIFFERS).astype(np.uint8)
-    mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)), np.uint8)
     if mask.mean() < _PERSON:
         return False
     border = (cv2.dilate(mask, np.ones((3, 3), np.uint8)) - cv2.erode(mask, np.ones((3, 3), np.uint8))) > 0

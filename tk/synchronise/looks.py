@@ -77,7 +77,9 @@ def look_at(recording: Recording, begin_s: float | None = None, length_s: float 
         VideoError: an image cannot be decoded.
     """
     begin = recording.span[0] if begin_s is None else begin_s
-    times, greys, turns = [], [], 0
+    times: list[float] = []
+    greys: list[Image] = []
+    turns = 0
     least = 0.0
     for time, image in _images(recording, begin, begin + length_s):
         if times and time - times[-1] < least:
@@ -88,7 +90,7 @@ def look_at(recording: Recording, begin_s: float | None = None, length_s: float 
         small = image.reformat(*size, format="gray", interpolation="AREA").to_ndarray()
         turns = quarter_turns(image)
         times.append(time)
-        greys.append(np.ascontiguousarray(np.rot90(small, turns)))
+        greys.append(np.ascontiguousarray(np.rot90(small, turns), np.uint8))
     if len(times) < 2:
         raise VideoError(f"{recording.paths[0]}: {recording.where}: has no pictures from {begin:.1f} s on")
     return Look(np.array(times), np.stack(greys), turns)
@@ -104,7 +106,8 @@ def pictures_at(recording: Recording, owns_s: list[float], height: int) -> list[
         while len(found) < len(wanted) and time > wanted[len(found)] - 1e-3:
             picture = np.rot90(image.to_ndarray(format="bgr24"), quarter_turns(image))
             width = round(picture.shape[1] * height / picture.shape[0])
-            found.append(cv2.resize(np.ascontiguousarray(picture), (width, height), interpolation=cv2.INTER_AREA))
+            small = cv2.resize(np.ascontiguousarray(picture), (width, height), interpolation=cv2.INTER_AREA)
+            found.append(np.asarray(small, np.uint8))
         if len(found) == len(wanted):
             break
     return found

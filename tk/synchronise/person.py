@@ -77,8 +77,8 @@ def compare_planes(looks: Sequence[Look], cameras: Sequence[Camera], mirrored: i
 
 
 def _signals(look: Look) -> tuple[float, Float]:
-    """Return the own time of the first sample, and the signals (N, 2) of a camera on the grid: the amount of motion, and
-    its vertical speed."""
+    """Return the own time of the first sample, and signals (N, 2) on the grid: the amount of motion, its vertical
+    speed."""
     amount, vertical = [], []
     for k, change in enumerate(look.changes):
         one, two = look.greys[k].astype(np.float32), look.greys[k + 1].astype(np.float32)
@@ -196,9 +196,9 @@ def align(pairs: Sequence[Compared], count: int, intervals_s: Sequence[float], k
     for pair in pairs:
         for lag in _peaks(pair.z, 3):
             placed = _place(count, by_pair, {pair.i: 0, pair.j: -(lag + pair.first)})
-            total = sum(between(i, j, placed[i] - placed[j]) for i, j in combinations(sorted(placed), 2))
-            if total > best[0]:
-                best = total, placed
+            score = sum(between(i, j, placed[i] - placed[j]) for i, j in combinations(sorted(placed), 2))
+            if score > best[0]:
+                best = score, placed
     placed = best[1]
     mean, second = np.full(count, -np.inf), np.full(count, np.inf)
     for c in placed:
@@ -239,7 +239,7 @@ def _total(c: int, pairs: dict[tuple[int, int], Compared], placed: dict[int, int
 
     The lag between cameras i and j is the difference of their positions.
     """
-    parts = []
+    parts: list[tuple[int, Float]] = []
     for other, at in placed.items():
         pair = pairs.get((min(c, other), max(c, other)))
         if pair is None:
@@ -251,9 +251,9 @@ def _total(c: int, pairs: dict[tuple[int, int], Compared], placed: dict[int, int
     if not parts:
         return 0, np.zeros(1), 0
     start = min(first for first, _ in parts)
-    total = np.zeros(max(first + len(z) for first, z in parts) - start)
-    for first, z in parts:
-        total[first - start : first - start + len(z)] += z
+    total = np.zeros(max(first + len(each) for first, each in parts) - start)
+    for first, each in parts:
+        total[first - start : first - start + len(each)] += each
     return start, total, len(parts)
 
 

@@ -198,7 +198,7 @@ def _read(name: str, paths: tuple[Path, ...]) -> Recording:
 
 def _marks(path: Path, interval_s: float) -> tuple[datetime | None, float | None]:
     """Return the creation time, and the timecode of the first image, seconds since midnight."""
-    container, stream = open_video(path)
+    container, _ = open_video(path)
     with container:
         tables = [container.metadata, *(each.metadata for each in container.streams)]
         created = next((table["creation_time"] for table in tables if "creation_time" in table), None)

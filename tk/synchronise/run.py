@@ -82,7 +82,7 @@ def synchronise(
         ties += found
         linked = connected_to(0, count, [(tie.i, tie.j) for tie in found])
         for c in np.flatnonzero(~linked).tolist():
-            silent = tracks[c] is None or tracks[c].silent  # type: ignore[union-attr]
+            silent = tracks[c] is None or tracks[c].silent
             reasons[c].append("it has no sound" if silent else "its sound is another one")
     looks = _look(recordings, ties, begin_s, progress)
     if "flash" in ways:

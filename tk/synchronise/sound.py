@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from tk.synchronise.ties import Tie
 
 Float = NDArray[np.float64]
 Samples = NDArray[np.float32]
+#: a window that confirms a lag: its middle, sample of the first track; lag, samples; height of the peak, deviations
+Hit = tuple[float, float, float]
 
 #: 1/s: of the samples that are compared. Speech and claps have most of their energy below half of it.
 RATE = 8000
@@ -125,7 +128,7 @@ def _onsets(samples: Samples) -> Float:
     """Return (N, B) onsets: how much louder each band becomes in a step, as its logarithm."""
     bands = []
     count = len(samples) // _HOP
-    for low, high in zip(_BANDS, _BANDS[1:], strict=False):
+    for low, high in pairwise(_BANDS):
         filtered = sosfiltfilt(butter(3, (low, high), "bandpass", fs=RATE, output="sos"), samples)
         energy = (filtered[: count * _HOP].reshape(count, _HOP) ** 2).mean(axis=1)
         level = np.log(energy + np.median(energy) / 4 + 1e-12)
@@ -135,10 +138,10 @@ def _onsets(samples: Samples) -> Float:
 
 
 def _compare(i: int, j: int, a: Track, b: Track, onsets_a: Float, onsets_b: Float) -> Heard:
-    lags, r, z = correlate(onsets_a, onsets_b, least=round(0.5 * RATE / _HOP))
+    lags, _, z = correlate(onsets_a, onsets_b, least=round(0.5 * RATE / _HOP))
     peaks, _ = find_peaks(z, distance=round(0.02 * RATE / _HOP))
     best = peaks[np.argsort(z[peaks])[::-1][:_CANDIDATES]]
-    found = []
+    found: list[tuple[int, list[Hit], bool]] = []
     for lag in [int(lags[k]) * _HOP for k in best] + _by_phase(a.samples, b.samples):
         if all(abs(lag - other) > 0.01 * RATE for other, _, _ in found):
             found.append((lag, *_confirm(a.samples, b.samples, lag)))
@@ -156,7 +159,7 @@ def _compare(i: int, j: int, a: Track, b: Track, onsets_a: Float, onsets_b: Floa
     return Heard(ties, len(hits), others)
 
 
-def _alike(one: Sequence[tuple[float, float, float]], other: Sequence[tuple[float, float, float]]) -> bool:
+def _alike(one: Sequence[Hit], other: Sequence[Hit]) -> bool:
     """Return whether two candidates found the same lag."""
     nearest = [min(other, key=lambda hit: abs(hit[0] - at)) for at, _, _ in one]
     apart = [abs(lag - hit[1]) for (_, lag, _), hit in zip(one, nearest, strict=True)]
@@ -184,16 +187,16 @@ def _phase(a: Samples, b: Samples) -> tuple[Float, int]:
     return np.fft.irfft(cross, size), size
 
 
-def _confirm(a: Samples, b: Samples, lag: int) -> tuple[list[tuple[float, float, float]], bool]:
-    """Return the windows that confirm a lag: (sample in ``a`` of the middle, lag in samples, strength), and whether one
-    of them convinces alone. Windows that disagree with the line through most of them are left out."""
+def _confirm(a: Samples, b: Samples, lag: int) -> tuple[list[Hit], bool]:
+    """Return the windows that confirm a lag, and whether one of them convinces alone. Windows that disagree with the
+    line through most of them are left out."""
     begin, end = max(0, lag), min(len(a), len(b) + lag)
     window = min(round(_WINDOW_S * RATE), end - begin)
     if window < RATE // 2:
         return [], False
     count = int(np.clip(2 * (end - begin) // window - 1, 1, _WINDOWS))
     reach = _REACH_S + _MOST_DRIFT * (end - begin) / RATE
-    hits: list[tuple[float, float, float]] = []
+    hits: list[Hit] = []
     lone = False
     for start in np.linspace(begin, end - window, count).round().astype(int).tolist():
         x, y = a[start : start + window], b[max(start - lag, 0) : start - lag + window]
@@ -224,9 +227,9 @@ def _peak(x: Samples, y: Samples, reach: int) -> tuple[float, float, float]:
     return k - reach + float(np.clip(shift, -0.5, 0.5)), float(near[k]) / noise, float(near[k]) / max(second, noise)
 
 
-def _on_a_line(hits: list[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
+def _on_a_line(hits: list[Hit]) -> list[Hit]:
     """Return the largest set of hits on one line with a slope that clocks can have."""
-    best: list[tuple[float, float, float]] = []
+    best: list[Hit] = []
     for n, (at, lag, _) in enumerate(hits):
         for other, at_other, _ in [*hits[n + 1 :], (at + 1.0, lag, 0.0)]:
             slope = (at_other - lag) / (other - at) if other != at else 0.0
@@ -239,7 +242,7 @@ def _on_a_line(hits: list[tuple[float, float, float]]) -> list[tuple[float, floa
     return best
 
 
-def _sigma(hits: Sequence[tuple[float, float, float]]) -> float:
+def _sigma(hits: Sequence[Hit]) -> float:
     """Return the standard deviation of a window's offset, seconds."""
     at, lag, _ = np.array(hits).T
     if len(hits) < 3:

@@ -86,7 +86,8 @@ def solve(count: int, ties: Sequence[Tie], reference: int = 0, skew_sigma_s: flo
 
     Pairs of cameras that contradict the others are left out, the worst first, as long as all cameras stay connected.
     """
-    kept, dropped = list(ties), []
+    kept = list(ties)
+    dropped: list[tuple[int, int, str]] = []
     while True:
         clocks, residuals = _fit(count, kept, reference, skew_sigma_s, np.full(count, RATE_SIGMA))
         worst, size = None, 1.0
@@ -114,8 +115,8 @@ def _fit(
     used = [tie for tie in ties if known[tie.i]]
     middle = np.zeros(count)  # own times about which rates act, so that offsets and rates are nearly independent
     for c in range(count):
-        own = [tie.own_i if tie.i == c else tie.own_j for tie in used if c in (tie.i, tie.j)]
-        middle[c] = (min(own) + max(own)) / 2 if own else 0.0
+        at = [tie.own_i if tie.i == c else tie.own_j for tie in used if c in (tie.i, tie.j)]
+        middle[c] = (min(at) + max(at)) / 2 if at else 0.0
     rows, right = [], []
     for tie in used:
         row = np.zeros(3 * count)
