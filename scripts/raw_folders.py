@@ -15,7 +15,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -65,10 +65,11 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Made:
-    """A camera of a RAW folder: common time = offset + rate · own time."""
+    """A camera of a RAW folder: common time = offset + rate · own time; and the time that sound takes to it."""
 
     offset_s: float
     rate: float
+    way_s: float
 
 
 def make_raw(capture: Path, folder: Path, recipe: Recipe) -> dict[str, Made]:
@@ -127,7 +128,7 @@ def make_raw(capture: Path, folder: Path, recipe: Recipe) -> dict[str, Made]:
             heard = _sound(recipe, total, random) if recipe.sound == "other" else played
             sound = _heard(heard, offset, rate, (end - first) / fps, way_s, random)
         _join(part, sound, folder / f"{name}.mp4", turned)
-        made[name] = Made(offset, rate)
+        made[name] = Made(offset, rate, way_s)
     if recipe.calibrated:
         shutil.copy(capture / "calibration.toml", folder / "calibration.toml")
     (folder / "truth.toml").write_text(
@@ -246,52 +247,50 @@ CASES = {
 }  # fmt: skip
 
 
-def errors_ms(folder: Path, made: dict[str, Made], ways: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the errors of the cameras that are synchronised, ms, their sigma, ms, and (C,) which cameras are not
-    sure."""
+def errors_ms(folder: Path, made: dict[str, Made], ways: Sequence[str]) -> tuple[np.ndarray, list[str]]:
+    """Return (3, N) of the cameras that are synchronised the error, the error beyond the way of the sound, and sigma,
+    ms; and the names of the others."""
     recordings = read_raw(folder)
     _, cameras = read_cameras(folder, recordings)
     done = synchronise(recordings, cameras, ways)
     first = made[recordings[0].name]
-    errors, sigmas, unsure = [], [], []
+    rows, unsure = [], []
     for c, recording in enumerate(recordings):
-        own = float(np.mean(recording.span))
-        true = made[recording.name].offset_s + made[recording.name].rate * own
-        found = first.offset_s + first.rate * done.clocks.common(c, own)
-        unsure.append(c in done.decision.unsure)
-        if c and not unsure[-1]:
-            errors.append(1000 * (found - true))
-            sigmas.append(1000 * float(done.clocks.offset_sigma_s[c]))
-    return np.array(errors), np.array(sigmas), np.array(unsure)
+        own, true = float(np.mean(recording.span)), made[recording.name]
+        if c in done.decision.unsure:
+            unsure.append(recording.name)
+        elif c:
+            found = first.offset_s + first.rate * done.clocks.common(c, own)
+            late = found - true.offset_s - true.rate * own
+            way = first.way_s - true.way_s if ways == ("sound",) else 0.0
+            rows.append((late, late - way, float(done.clocks.offset_sigma_s[c])))
+    return 1000 * np.abs(np.array(rows).reshape(-1, 3).T), unsure
 
 
 def main() -> None:
     """Print a table of errors."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", nargs="+", type=Path)
-    parser.add_argument("--cases", default=",".join(CASES).replace(", ", "; "), help="separated by commas")
-    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--cases", default=";".join(CASES), help="separated by semicolons")
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep", type=Path, help="keep the folders here")
     given = parser.parse_args()
-    print("| capture | method | largest error, ms | mean error, ms | σ, ms | not sure |\n|---|---|---|---|---|---|")
+    print("| capture | method | largest error, ms | without the way of the sound, ms | σ, ms | not sure |")
+    print("|---|---|---|---|---|---|")
     for capture in given.captures:
-        for case in given.cases.split(","):
-            name = case.replace("; ", ", ")
+        for name in given.cases.split(";"):
             recipe, ways = CASES[name]
-            for seed in range(given.seeds):
-                with tempfile.TemporaryDirectory() as temporary:
-                    where = (given.keep or Path(temporary)) / f"{capture.name}-{name.replace(', ', '-')}-{seed}"
-                    made = make_raw(capture, where, Recipe(**{**recipe.__dict__, "seed": seed}))
-                    try:
-                        errors, sigmas, unsure = errors_ms(where, made, ways)
-                    except TkError as error:
-                        print(f"| {capture.name} | {name} | {error} | | | |", flush=True)
-                        continue
-                    if len(errors):
-                        text = f"{np.abs(errors).max():.1f} | {np.abs(errors).mean():.1f} | {sigmas.max():.1f}"
-                    else:
-                        text = "– | – | –"
-                    print(f"| {capture.name} | {name} | {text} | {unsure.sum()} of {len(unsure)} |", flush=True)
+            with tempfile.TemporaryDirectory() as temporary:
+                where = (given.keep or Path(temporary)) / f"{capture.name}-{name.replace(', ', '-').replace(' ', '-')}"
+                made = make_raw(capture, where, replace(recipe, seed=given.seed))
+                try:
+                    errors, unsure = errors_ms(where, made, ways)
+                except TkError as error:
+                    print(f"| {capture.name} | {name} | {error} | | | |", flush=True)
+                    continue
+                late, beyond, sigma = errors.max(axis=1) if errors.size else np.full(3, np.nan)
+                text = f"{late:.1f} | {beyond:.1f} | {sigma:.1f}" if errors.size else "– | – | –"
+                print(f"| {capture.name} | {name} | {text} | {len(unsure)} of {len(made)} |", flush=True)
 
 
 if __name__ == "__main__":
