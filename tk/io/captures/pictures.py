@@ -55,6 +55,10 @@ class _PictureReader:
     def skip(self) -> None:
         self._index += 1
 
+    def jump(self, number: int) -> int:
+        self._index = max(number, self._index)
+        return self._index
+
     def read(self, out: Image) -> None:
         clip = self._clip
         if self._index >= len(clip.files):
