@@ -170,8 +170,8 @@ def run_raw(folder: Path, force: bool, quiet: bool, no_report: bool) -> None:
     raw, boards, capture = (folder / name for name in ("RAW", "BOARDS", "CAPTURE"))
     result = folder / "result.h5"
     lines = [
-        ["sync", raw, "-o", boards, "--from", f"{BOARDS_S:g}", "--to", f"{EMPTY_S - 1:g}"],
-        ["calibrate", boards, "--square", f"{SQUARE_M:g}", "-o", capture / "calibration.toml", "--force"],
+        ["sync", raw, "-o", boards, "--from", f"{BOARDS_S:g}", "--to", f"{EMPTY_S - 1:g}", "--by", "sound"],
+        ["calibrate", boards, "--square", f"{SQUARE_M:g}", "-o", raw / "calibration.toml"],
         ["sync", raw, "-o", capture, "--from", f"{PERSON_S:g}", "--to", f"{PERSON_S + 5:g}",
          "--empty", f"{EMPTY_S:g}:{PERSON_S - 0.5:g}"],
         ["track", capture, "-o", result, "--force", *(["--no-report"] if no_report else [])],
