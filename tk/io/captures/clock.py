@@ -17,6 +17,7 @@ from tk.errors import CaptureError, ClockError
 from tk.io.captures.capture_toml import CaptureSettings, Span
 from tk.io.captures.clip import Clip, Reader
 from tk.io.captures.clip_folder import MASKS_RECORD
+from tk.io.captures.referred import open_referred, referred_stamps
 from tk.io.captures.timing import DRIFT_FRAMES, ROUNDED, ROUNDED_INTERVAL, Stamps, nominal_rate
 from tk.io.toml import load_toml
 
@@ -239,6 +240,20 @@ def put_on_clock(
         tuple(map(clock.late_s, stamps, pictures)),
         _empty_scene(clips, stamps, settings.span, where),
     )
+
+
+def clips_on_clock(folder: Path, settings: CaptureSettings, warn: Callable[[str], None]) -> dict[str, Clip]:
+    """Return the clips of `[videos]` in a folder, on their common clock, without a calibration.
+
+    Raises:
+        CaptureError: see :func:`~tk.io.captures.referred.open_referred` and :func:`put_on_clock`.
+    """
+    clips = open_referred(folder, settings.videos)
+    regular = settings.fps if settings.times == "fps" else None
+    stamps = referred_stamps(list(clips.values()), list(settings.videos.values()), regular)
+    recorded = {name: (clip, own) for (name, clip), own in zip(clips.items(), stamps, strict=True)}
+    timed = put_on_clock(recorded, None, settings, folder / "capture.toml", warn)
+    return dict(zip(clips, timed.clips, strict=True))
 
 
 def recorded_clock(folder: Path, clock: Clock) -> bool:
