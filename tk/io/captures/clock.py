@@ -222,7 +222,7 @@ def put_on_clock(
     clock = choose_clock(stamps, settings.fps, settings.span, where, warn)
     pictures = [clock.nearest(each) for each in stamps]
     missing = [f"{name} {(n < 0).sum()}" for name, n in zip(recorded, pictures, strict=True) if (n < 0).any()]
-    if any(not np.array_equal(numbers, np.arange(len(numbers))) for numbers in pictures):
+    if round(clock.begin_s, 3) or any(not np.array_equal(numbers, np.arange(len(numbers))) for numbers in pictures):
         warn(
             f"resampled to {clock.fps:.5g} frames/s by the time stamps, from {clock.begin_s:.3f} s of the common time"
             + (f"; frames without an image: {', '.join(missing)}" if missing else "")
