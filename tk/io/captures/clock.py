@@ -135,6 +135,8 @@ def _limits(begin: float, end: float, span: Span, where: Path, warn: Callable[[s
         raise CaptureError(f"{where}: from = {span.begin:g} is after the end of the videos, {end:.2f} s")
     if span.end is not None and span.end <= begin:
         raise CaptureError(f"{where}: to = {span.end:g} is before the videos have begun, {begin:.2f} s")
+    if (span.begin is not None and span.begin < begin) or (span.end is not None and span.end > end):
+        warn(f"{where}: from and to reach beyond the videos, which all have images from {begin:.2f} to {end:.2f} s")
     low = begin if span.begin is None else max(begin, span.begin)
     high = end if span.end is None else min(end, span.end)
     if span.empty is None or span.empty[1] <= low or span.empty[0] >= high:
@@ -214,7 +216,8 @@ def put_on_clock(
             given = Stamps(clip.path, np.arange(clip.frame_count) / settings.fps, common=False)
         if given is None:
             raise CaptureError(
-                f"{clip.path}: nothing gives the times of its images, so they cannot be resampled; add timestamps/"
+                f"{clip.path}: nothing gives the times of its images, so they cannot be resampled; add timestamps/, "
+                'or, if its rate is regular, fps and times = "fps" in capture.toml'
                 if clip.frame_count > 1
                 else f"{clip.path}: holds one image; put a video in its place"
             )
@@ -223,8 +226,12 @@ def put_on_clock(
     pictures = [clock.nearest(each) for each in stamps]
     missing = [f"{name} {(n < 0).sum()}" for name, n in zip(recorded, pictures, strict=True) if (n < 0).any()]
     if round(clock.begin_s, 3) or any(not np.array_equal(numbers, np.arange(len(numbers))) for numbers in pictures):
+        spans = {name: each.since_start[[0, -1]] for name, each in zip(recorded, stamps, strict=True)}
+        first, last = max(spans, key=lambda name: spans[name][0]), min(spans, key=lambda name: spans[name][1])
         warn(
-            f"resampled to {clock.fps:.5g} frames/s by the time stamps, from {clock.begin_s:.3f} s of the common time"
+            f"resampled to {clock.fps:.5g} frames/s by the time stamps, from {clock.times_s[0]:.3f} s to "
+            f"{clock.times_s[-1]:.3f} s of the common time; {first} begins last, at {spans[first][0]:.3f} s, "
+            f"{last} ends first, at {spans[last][1]:.3f} s"
             + (f"; frames without an image: {', '.join(missing)}" if missing else "")
         )
     if masks is not None:
