@@ -59,7 +59,7 @@ def open_clips(calibration: Calibration, path: Path) -> tuple[Clip, ...]:
     for folder in (path / "videos", path / "images"):
         if folder.is_dir():
             return clips_of(calibration, folder, "video" if folder.name == "videos" else "folder of pictures", "mp4")
-    raise VideoError(f"{path}: has neither videos/ nor images/")
+    raise VideoError(f"{path}: has neither videos/ nor images/, and its capture.toml no [videos]")
 
 
 def open_masks(calibration: Calibration, path: Path, masks: str) -> tuple[Clip, ...] | None:

@@ -17,6 +17,7 @@ from tk.errors import CaptureError, ClockError
 from tk.io.captures.capture_toml import CaptureSettings, Span
 from tk.io.captures.clip import Clip, Reader
 from tk.io.captures.clip_folder import MASKS_RECORD
+from tk.io.captures.referred import open_referred, referred_stamps
 from tk.io.captures.timing import DRIFT_FRAMES, ROUNDED, ROUNDED_INTERVAL, Stamps, nominal_rate
 from tk.io.toml import load_toml
 
@@ -134,6 +135,8 @@ def _limits(begin: float, end: float, span: Span, where: Path, warn: Callable[[s
         raise CaptureError(f"{where}: from = {span.begin:g} is after the end of the videos, {end:.2f} s")
     if span.end is not None and span.end <= begin:
         raise CaptureError(f"{where}: to = {span.end:g} is before the videos have begun, {begin:.2f} s")
+    if (span.begin is not None and span.begin < begin) or (span.end is not None and span.end > end):
+        warn(f"{where}: from and to reach beyond the videos, which all have images from {begin:.2f} to {end:.2f} s")
     low = begin if span.begin is None else max(begin, span.begin)
     high = end if span.end is None else min(end, span.end)
     if span.empty is None or span.empty[1] <= low or span.empty[0] >= high:
@@ -213,7 +216,8 @@ def put_on_clock(
             given = Stamps(clip.path, np.arange(clip.frame_count) / settings.fps, common=False)
         if given is None:
             raise CaptureError(
-                f"{clip.path}: nothing gives the times of its images, so they cannot be resampled; add timestamps/"
+                f"{clip.path}: nothing gives the times of its images, so they cannot be resampled; add timestamps/, "
+                'or, if its rate is regular, fps and times = "fps" in capture.toml'
                 if clip.frame_count > 1
                 else f"{clip.path}: holds one image; put a video in its place"
             )
@@ -221,9 +225,13 @@ def put_on_clock(
     clock = choose_clock(stamps, settings.fps, settings.span, where, warn)
     pictures = [clock.nearest(each) for each in stamps]
     missing = [f"{name} {(n < 0).sum()}" for name, n in zip(recorded, pictures, strict=True) if (n < 0).any()]
-    if any(not np.array_equal(numbers, np.arange(len(numbers))) for numbers in pictures):
+    if round(clock.begin_s, 3) or any(not np.array_equal(numbers, np.arange(len(numbers))) for numbers in pictures):
+        spans = {name: each.since_start[[0, -1]] for name, each in zip(recorded, stamps, strict=True)}
+        first, last = max(spans, key=lambda name: spans[name][0]), min(spans, key=lambda name: spans[name][1])
         warn(
-            f"resampled to {clock.fps:.5g} frames/s by the time stamps, from {clock.begin_s:.3f} s of the common time"
+            f"resampled to {clock.fps:.5g} frames/s by the time stamps, from {clock.times_s[0]:.3f} s to "
+            f"{clock.times_s[-1]:.3f} s of the common time; {first} begins last, at {spans[first][0]:.3f} s, "
+            f"{last} ends first, at {spans[last][1]:.3f} s"
             + (f"; frames without an image: {', '.join(missing)}" if missing else "")
         )
     if masks is not None:
@@ -239,6 +247,20 @@ def put_on_clock(
         tuple(map(clock.late_s, stamps, pictures)),
         _empty_scene(clips, stamps, settings.span, where),
     )
+
+
+def clips_on_clock(folder: Path, settings: CaptureSettings, warn: Callable[[str], None]) -> dict[str, Clip]:
+    """Return the clips of `[videos]` in a folder, on their common clock, without a calibration.
+
+    Raises:
+        CaptureError: see :func:`~tk.io.captures.referred.open_referred` and :func:`put_on_clock`.
+    """
+    clips = open_referred(folder, settings.videos)
+    regular = settings.fps if settings.times == "fps" else None
+    stamps = referred_stamps(list(clips.values()), list(settings.videos.values()), regular)
+    recorded = {name: (clip, own) for (name, clip), own in zip(clips.items(), stamps, strict=True)}
+    timed = put_on_clock(recorded, None, settings, folder / "capture.toml", warn)
+    return dict(zip(clips, timed.clips, strict=True))
 
 
 def recorded_clock(folder: Path, clock: Clock) -> bool:

@@ -169,7 +169,8 @@ def read_contents(path: Path) -> Contents:
         times = times if found is None else found
     times = times[len(times) - count :] if len(times) >= count else np.empty(0)
     increasing = len(times) == count and bool((np.diff(times) > 0).all())
-    begins = np.array([packet.time for packet in packets if packet.key and not packet.discarded and increasing])
+    ordered = increasing and not reordered_avi
+    begins = np.array([packet.time for packet in packets if packet.key and not packet.discarded and ordered])
     return Contents(
         width=images[0].height if turns % 2 else images[0].width,
         height=images[0].width if turns % 2 else images[0].height,

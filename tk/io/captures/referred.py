@@ -130,15 +130,6 @@ def open_video_files(paths: Sequence[Path], size: tuple[int, int] | None = None)
     return clips[0] if len(clips) == 1 else Chapters.of(clips)
 
 
-def check_no_folders(folder: Path) -> None:
-    """Raise an error if a capture has folders whose content `[videos]` would contradict."""
-    for name in ("videos", "images", "timestamps"):
-        if (folder / name).is_dir():
-            raise CaptureError(
-                f"{folder / 'capture.toml'}: has [videos], and the folder {name}/ is there, too; keep one of them"
-            )
-
-
 def open_referred(
     folder: Path, videos: Mapping[str, GivenVideo], sizes: Mapping[str, tuple[int, int]] | None = None
 ) -> dict[str, Clip]:
@@ -146,8 +137,13 @@ def open_referred(
     are wanted.
 
     Raises:
-        CaptureError: a file is missing, is given twice, or cannot be read.
+        CaptureError: a file is missing, is given twice, or cannot be read, or a folder of the capture contradicts them.
     """
+    for name in ("videos", "images", "timestamps"):
+        if (folder / name).is_dir():
+            raise CaptureError(
+                f"{folder / 'capture.toml'}: has [videos], and the folder {name}/ is there, too; keep one of them"
+            )
     files: dict[str, list[Path]] = {}
     users: dict[Path, str] = {}
     for name, video in videos.items():
@@ -180,7 +176,6 @@ def referred_clips(
     Raises:
         CaptureError: a name belongs to no camera, a camera has no video, or a video cannot be read or has another size.
     """
-    check_no_folders(folder)
     where = folder / "capture.toml"
     names: dict[str, str] = {}  # of the tables, by camera
     for camera, key in zip(known.rig, known.keys, strict=True):

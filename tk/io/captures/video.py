@@ -33,6 +33,7 @@ _EVERY, _MOST_DIFFERENCE = 4, 8.0
 #: key images, the nearest first, from which decoding is tried: at the first ones of a gradual refresh images are not
 #: whole. After these the file is decoded from its start.
 _KEYS_TRIED = 4
+_WITHOUT_INDEX = ("mpegts", "mpeg")  # FFmpeg's names of containers
 
 
 @dataclass(frozen=True)
@@ -280,10 +281,13 @@ class _PyAVReader:
         """Let decoding begin at a key image; return whether it is whole then."""
         import av.error
 
-        times, self._waiting = self._clip.times_s, None
+        times = self._clip.times_s
         assert times is not None
+        # containers without an index are sought by decoding times, which are earlier than presentation times
+        start = max(key - REORDERED, 0) if self._container.format.name in _WITHOUT_INDEX else key
+        self._waiting = None
         try:
-            self._container.seek(round(times[key] / self._stream.time_base), stream=self._stream)
+            self._container.seek(round(times[start] / self._stream.time_base), stream=self._stream)
             self._images = decoded(self._container.demux(self._stream))
             image = next(self._images)
             while 0 <= self._number(image) < key:

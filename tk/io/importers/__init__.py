@@ -10,6 +10,7 @@ from tk.io.captures.capture import Capture, open_capture
 from tk.io.importers import easymocap, opencap, panoptic, projections, qualisys, toml_tools, vicon
 from tk.io.importers.project import Format, Project, read_format
 from tk.io.importers.write import Imported, write_capture
+from tk.io.paths import referred_files
 
 __all__ = ["FORMATS", "Imported", "import_project", "read_project"]
 
@@ -66,7 +67,7 @@ def open_recording(
     try:
         return open_capture(path, cameras, masks, resample)
     except CaptureError as error:
-        images = (path / "videos").is_dir() or (path / "images").is_dir()
+        images = (path / "videos").is_dir() or (path / "images").is_dir() or bool(referred_files(path))
         if path.is_dir() and not (images and (path / "calibration.toml").exists()):
             found = _find(path)
             # calibration.toml is a capture's file, too; then the videos' folder decides
