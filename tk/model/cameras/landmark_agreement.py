@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.model.cameras.camera import Camera, Rig
-from tk.model.cues.landmarks import deviation, log_ratio
+from tk.model.cues.landmarks import deviation, log_ratio, right_share
 
 Float = NDArray[np.float64]
 
@@ -106,10 +106,12 @@ def _fits(rig: Rig, seen: Float, c: int, sets: Float) -> Float:
 
 
 class _Points(NamedTuple):
-    """Points of a person by the landmarks of some cameras: (L, 3), metres, NaN if unknown, and (L, 3, 3) covariance."""
+    """Points of a person by the landmarks of some cameras: (L, 3), metres, NaN if unknown, (L, 3, 3) covariance, and
+    (L,) the probability that all these landmarks are right."""
 
     at: Float
     covariance: Float
+    right: Float
 
 
 def _points(rig: Rig, seen: Float, cameras: Sequence[int], near: Float | None = None) -> _Points:
@@ -117,6 +119,7 @@ def _points(rig: Rig, seen: Float, cameras: Sequence[int], near: Float | None = 
     between two cameras that face each other, lies within :data:`REACH_M` of ``near`` (L, 3); None: of the solution."""
     L = seen.shape[1]
     information, pull, known = np.zeros((L, 3, 3)), np.zeros((L, 3)), np.zeros(L, np.int64)
+    right = np.ones(L)
     for c in cameras:
         own = np.isfinite(seen[c]).all(axis=1)
         rays = rig[c].rays(seen[c, own, :2])
@@ -124,12 +127,13 @@ def _points(rig: Rig, seen: Float, cameras: Sequence[int], near: Float | None = 
         information[own] += across
         pull[own] += across @ rig[c].center
         known[own] += 1
+        right[own] *= right_share(seen[c, own, 2])
     if near is None:
         near = np.full((L, 3), np.nan)
         near[known > 1] = (np.linalg.pinv(information[known > 1]) @ pull[known > 1, :, None])[..., 0]
     covariance = np.asarray(np.linalg.inv(information + np.eye(3) / REACH_M**2))
     at = (covariance @ (pull + near / REACH_M**2)[..., None])[..., 0]
-    return _Points(np.where((known > 0)[:, None], at, np.nan), covariance)
+    return _Points(np.where((known > 0)[:, None], at, np.nan), covariance, right)
 
 
 def _fit_of_points(camera: Camera, own: Float, points: _Points) -> float:
@@ -145,4 +149,4 @@ def _fit_of_points(camera: Camera, own: Float, points: _Points) -> float:
     # rows of the derivative of the position across the camera's axis by the point
     P = camera.rotation[:2] - ray[:, :, None] * camera.rotation[2]
     spread = P @ points.covariance[known] @ P.swapaxes(1, 2)
-    return log_ratio(np.where(depth[:, None] > 0, away, np.inf), own[known, 2], spread)
+    return log_ratio(np.where(depth[:, None] > 0, away, np.inf), own[known, 2], spread, points.right[known])

@@ -104,7 +104,7 @@ class LandmarkCue:
         known = np.asarray(np.isfinite(seen).all(axis=-1))
         visibility = np.where(known, seen[..., 2], 0.0)
         self._sigma = SEEN_M * size * HIDDEN ** (1.0 - visibility)  # (..., V, L)
-        self._right = np.where(known, RIGHT_HIDDEN + (RIGHT_SEEN - RIGHT_HIDDEN) * visibility, 0.0)
+        self._right = np.where(known, right_share(visibility), 0.0)
         self._at = np.where(known[..., None], seen[..., :2], 0.0)
         # what is hidden in the images is guessed in all of them alike
         images = np.maximum(np.count_nonzero(known, axis=-2), 1)
@@ -187,7 +187,12 @@ def deviation(visibility: Float) -> Float:
     return np.asarray(np.hypot(SEEN_M, OFFSET_M) * HIDDEN ** (1.0 - visibility))
 
 
-def log_ratio(away_m: Float, visibility: Float, spread: Float | None = None) -> float:
+def right_share(visibility: Float) -> Float:
+    """Return the probability that landmarks are right, by their visibility."""
+    return np.asarray(RIGHT_HIDDEN + (RIGHT_SEEN - RIGHT_HIDDEN) * visibility)
+
+
+def log_ratio(away_m: Float, visibility: Float, spread: Float | None = None, known: Float | None = None) -> float:
     """Return the logarithm of the likelihood of landmarks (N,) that are right, against that of wrong ones, nats.
 
     Args:
@@ -195,8 +200,9 @@ def log_ratio(away_m: Float, visibility: Float, spread: Float | None = None) -> 
         visibility: (N,).
         spread: (N, 2, 2) covariance of where they should be; None: it is known. What is open to a right landmark is
             open to a wrong one, too, so an unknown place gives a ratio near 0.
+        known: (N,) probability that this place is right; None: 1.
     """
-    right = RIGHT_HIDDEN + (RIGHT_SEEN - RIGHT_HIDDEN) * visibility
+    right = right_share(visibility) * (1.0 if known is None else known)
     covariance = deviation(visibility)[:, None, None] ** 2 * np.eye(2) + (0.0 if spread is None else spread)
     finite = np.asarray(np.isfinite(away_m).all(axis=1))
     away = np.where(finite[:, None], away_m, 0.0)
@@ -231,7 +237,7 @@ def contradiction(rig: Rig, body: ConeBody, pose: Float, seen: Float) -> Float:
     expected = 3 * (np.hypot(OFFSET_M, SEEN_M) * size * HIDDEN ** (1.0 - visibility)) ** 2
     place = places(body.dimensions) @ body.skeleton.T_world_body.T
     square = ((body.skeleton.points(pose, SEGMENT, place) - points) ** 2).sum(axis=-1)
-    right = RIGHT_HIDDEN + (RIGHT_SEEN - RIGHT_HIDDEN) * visibility
+    right = right_share(visibility)
     excess = np.where(np.isfinite(square), right * np.maximum(square - expected, 0.0) / 6, 0.0)
     by_name = dict(zip(LANDMARKS, excess.tolist(), strict=True))
 
