@@ -160,7 +160,7 @@ FAULTS: dict[str, tuple[Callable[[Path], object], tuple[str, ...], str]] = {
     "contradiction": (contradicting, (), "camera b: not sure when it was recorded: its sound and its pictures"),
     "mirrored": (mirrored, (), "camera b: not sure when it was recorded: its picture is mirrored"),
     "constant": (constant, (), "camera b: shows the same picture all the time"),
-    "no sound, no motion": (no_sound_no_motion, (), "camera b: not sure when it was recorded: it has no sound; nothing"),
+    "no sound, no motion": (no_sound_no_motion, (), "camera b: not sure when it was recorded: it has no sound"),
     "one second": (lambda folder: write(folder / "b.mp4", seen(1, 0, 1.0)), (), "camera b: is 1.0 s long"),
     "no video": (lambda folder: (folder / "b.mp4").write_bytes(b"text" * 99), (), "b.mp4: is not a video"),
     "one camera": (only_one, (), "holds one camera, a"),
