@@ -95,11 +95,11 @@ def sync(raw: Path, output: Path, **given: Any) -> None:
                 done = by_hand(recordings, given["offsets"], given["begin"])
             else:
                 done = synchronise(recordings, cameras, ways, given["begin"], reporter.stage)
-            for line in done.decision.notes:
-                reporter.note(line)
             if done.decision.unsure:
                 _print(done, given["as_json"])
                 raise refused(recordings, done.decision)
+            for line in done.decision.notes:
+                reporter.note(line)
             span = chosen_span(done, given["begin"], given["end"])
             empty = empty_part(done, given["empty"])
             span = without_empty(span, empty, given["begin"], given["end"])

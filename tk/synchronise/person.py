@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import cv2
@@ -31,21 +31,33 @@ LEAST_S = 2.0
 _PLANES, _BEYOND = 48, 0.01
 #: least sine of the angle between a ray and the line through both cameras: beside it, planes are not determined
 _LEAST_SINE = 0.2
+#: standard deviation of the lag of a pair, with known cameras and without: least, seconds, and share of an interval
+_SIGMA = {"cameras": (0.002, 0.06), "person": (0.005, 0.33)}
 #: seconds over which signals without known cameras are compared with their surroundings
 _SLOW_S = 1.5
 
 
 @dataclass(frozen=True)
 class Compared:
-    """A pair of cameras: significance of each lag, grid samples from ``first`` on, and of the coefficient."""
+    """A pair of cameras, compared at each lag.
+
+    Attributes:
+        i, j: the cameras.
+        first: the first lag, samples of the grid.
+        z, r: (L,) significance and coefficient of each lag.
+        start_i, start_j: own time of sample 0 of each camera, seconds.
+        sine: of the angle between the line through both cameras and the rays to what moves: if it is small, planes are
+            determined badly. 1 without known cameras.
+    """
 
     i: int
     j: int
     first: int
     z: Float
     r: Float
-    start_i: float  # own time of sample 0 of each camera
+    start_i: float
     start_j: float
+    sine: float = 1.0
 
     def at(self, lag: int) -> float:
         """Return the significance of a lag; 0 outside the range."""
@@ -70,7 +82,7 @@ def compare_planes(looks: Sequence[Look], cameras: Sequence[Camera], mirrored: i
     def one(pair: tuple[int, int]) -> Compared | None:
         i, j = pair
         profiles = _profiles(looks[i], looks[j], rays[i], rays[j], cameras[i].center, cameras[j].center)
-        return None if profiles is None else _compared(i, j, *profiles)
+        return None if profiles is None else replace(_compared(i, j, *profiles[:2]), sine=profiles[2])
 
     with ThreadPoolExecutor(2) as threads:
         return [found for found in threads.map(one, pairs) if found is not None]
@@ -126,19 +138,21 @@ def _rays(look: Look, camera: Camera, mirrored: bool) -> Float:
 
 def _profiles(
     a: Look, b: Look, rays_a: Float, rays_b: Float, center_a: Float, center_b: Float
-) -> tuple[tuple[float, Float], tuple[float, Float]] | None:
-    """Return the motion in each plane through the centres, (N, P) on the grid, for both cameras; None if they share too
-    few planes."""
+) -> tuple[tuple[float, Float], tuple[float, Float], float] | None:
+    """Return the motion in each plane through the centres, (N, P) on the grid, for both cameras, and the sine of
+    :class:`Compared`; None if they share too few planes."""
     base = center_b - center_a
     base = base / np.linalg.norm(base)
     side = np.cross(base, np.eye(3)[np.argmin(np.abs(base))])
     side /= np.linalg.norm(side)
     third = np.cross(base, side)
-    angles, usable, totals = [], [], []
+    angles, usable, totals, means = [], [], [], []
     for look, rays in ((a, rays_a), (b, rays_b)):
         angles.append(np.arctan2(rays @ third, rays @ side))
-        usable.append(np.linalg.norm(np.cross(rays, base), axis=2) > _LEAST_SINE)
+        sine = np.linalg.norm(np.cross(rays, base), axis=2)
+        usable.append(sine > _LEAST_SINE)
         totals.append(np.where(usable[-1], look.changes.sum(axis=0), 0.0))
+        means.append(float((sine * totals[-1]).sum() / max(totals[-1].sum(), 1e-9)))
     if not all(total.any() for total in totals):
         return None
     middle = float(np.angle((totals[0] * np.exp(1j * angles[0])).sum()))
@@ -156,7 +170,7 @@ def _profiles(
         sums = np.sqrt(gaussian_filter1d(sums, 1.0, axis=1) / np.diff(look.times_s)[:, None])
         start, grid = on_grid(look.middles_s, sums)
         found.append((start, grid - grid.mean(axis=0)))
-    return found[0], found[1]
+    return found[0], found[1], min(means)
 
 
 def _quantiles(values: Float, weights: Float) -> tuple[float, float]:
@@ -284,8 +298,8 @@ def _tie(pair: Compared, lag: int, intervals_s: Sequence[float], kind: str) -> T
     if curve >= 0:
         return None
     lag_s = (k + float(np.clip(-slope / (2 * curve), -half, half)) + pair.first) / GRID_HZ
-    share = 0.1 if kind == "cameras" else 0.5
-    sigma = (0.002 if kind == "cameras" else 0.005) + share * interval / (1 if kind == "cameras" else 1.5)
+    least, share = _SIGMA[kind]
+    sigma = (least + share * interval) / pair.sine**2
     # the middle of the samples that both have
     count_j = 1 - pair.first
     count_i = len(pair.z) + 1 - count_j

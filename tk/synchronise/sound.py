@@ -13,7 +13,7 @@ from scipy.signal import butter, find_peaks, sosfiltfilt
 
 from tk.io.captures.packets import open_video
 from tk.synchronise.lags import correlate, fast_length
-from tk.synchronise.raw import Recording
+from tk.synchronise.raw import SHORTEST_S, Recording
 from tk.synchronise.ties import Tie
 
 Float = NDArray[np.float64]
@@ -29,13 +29,17 @@ _HOP, _BANDS = 40, (150, 500, 1000, 2000, 3800)
 _CANDIDATES = 6
 #: seconds of a window, most windows, and how far the phase is searched about a candidate, without drift
 _WINDOW_S, _WINDOWS, _REACH_S = 4.0, 24, 0.03
+#: seconds about a peak in which the noise is measured
+_LOCAL_S = 0.02
 #: seconds beside that range in which no echo may be higher: the sound itself would lie there
 _BESIDE_S = 0.3
 #: a window confirms if its peak is so many times the noise's deviation, and so many times the second peak. Of
-#: independent noise the highest of all lags has 4 deviations.
-_PEAK, _SECOND = 7.0, 1.25
-#: the same where one window alone must convince
-_LONE_PEAK, _LONE_SECOND = 14.0, 1.6
+#: independent noise, and of two short bursts, the highest of all lags has 4 to 5 deviations.
+_PEAK, _SECOND = 6.0, 1.25
+#: windows that must agree, or all of fewer: loud bursts of two other sounds may fit by chance in one or two
+_AGREEING = 4
+#: the same limits where one window alone must convince
+_LONE_PEAK, _LONE_SECOND = 8.0, 1.5
 #: windows agree if they differ by less, seconds
 _AGREE_S = 0.002
 #: least standard deviation of a window's offset, seconds: echoes and the way of the sound change
@@ -138,7 +142,7 @@ def _onsets(samples: Samples) -> Float:
 
 
 def _compare(i: int, j: int, a: Track, b: Track, onsets_a: Float, onsets_b: Float) -> Heard:
-    lags, _, z = correlate(onsets_a, onsets_b, least=round(0.5 * RATE / _HOP))
+    lags, _, z = correlate(onsets_a, onsets_b, least=round(SHORTEST_S * RATE / _HOP))
     peaks, _ = find_peaks(z, distance=round(0.02 * RATE / _HOP))
     best = peaks[np.argsort(z[peaks])[::-1][:_CANDIDATES]]
     found: list[tuple[int, list[Hit], bool]] = []
@@ -149,14 +153,25 @@ def _compare(i: int, j: int, a: Track, b: Track, onsets_a: Float, onsets_b: Floa
     if not found:
         return Heard((), 0, 0)
     hits = found[0][1]
-    others = max((len(each[1]) for each in found[1:] if each[1] and not _alike(each[1], hits)), default=0)
-    lone = len(hits) == 1 and found[0][2]
-    sure = (len(hits) >= 2 or lone) and len(hits) > 2 * others
+    others = max((_apart(each[1]) for each in found[1:] if each[1] and not _alike(each[1], hits)), default=0)
+    lag = found[0][0]
+    both_s = (min(len(a.samples), len(b.samples) + lag) - max(0, lag)) / RATE
+    enough = min(_AGREEING, max(2, both_s // _WINDOW_S))  # all windows of a short recording
+    sure = (_apart(hits) >= enough or found[0][2]) and _apart(hits) > 2 * others
     if not sure:
-        return Heard((), len(hits), others)
+        return Heard((), _apart(hits), others)
     sigma = _sigma(hits)
     ties = tuple(Tie(i, j, a.start_s + at / RATE, b.start_s + (at - lag) / RATE, sigma, "sound") for at, lag, _ in hits)
-    return Heard(ties, len(hits), others)
+    return Heard(ties, _apart(hits), others)
+
+
+def _apart(hits: Sequence[Hit]) -> int:
+    """Return the number of hits whose windows do not overlap."""
+    count, last = 0, -np.inf
+    for at, _, _ in sorted(hits):
+        if at - last >= _WINDOW_S * RATE * 0.99:
+            count, last = count + 1, at
+    return count
 
 
 def _alike(one: Sequence[Hit], other: Sequence[Hit]) -> bool:
@@ -192,7 +207,7 @@ def _confirm(a: Samples, b: Samples, lag: int) -> tuple[list[Hit], bool]:
     line through most of them are left out."""
     begin, end = max(0, lag), min(len(a), len(b) + lag)
     window = min(round(_WINDOW_S * RATE), end - begin)
-    if window < RATE // 2:
+    if window < SHORTEST_S * RATE:
         return [], False
     count = int(np.clip(2 * (end - begin) // window - 1, 1, _WINDOWS))
     reach = _REACH_S + _MOST_DRIFT * (end - begin) / RATE
@@ -216,8 +231,11 @@ def _peak(x: Samples, y: Samples, reach: int) -> tuple[float, float, float]:
     reach = min(reach, len(x) // 2)
     near = np.concatenate([phase[-reach:], phase[: reach + 1]])
     k = int(np.argmax(near))
-    noise = 1.4826 * float(np.median(np.abs(phase))) + 1e-12
-    away = np.abs(np.arange(len(near)) - k) > _AGREE_S * RATE
+    # two short bursts are unrelated to each other only at lags at which they overlap: the noise is that beside the peak
+    far = np.abs(np.arange(len(near)) - k)
+    beside = near[(far > _AGREE_S / 2 * RATE) & (far < _LOCAL_S * RATE)]
+    noise = max(1.4826 * float(np.median(np.abs(phase))), float(beside.std()) if len(beside) else 0.0) + 1e-12
+    away = far > _AGREE_S * RATE
     second = float(near[away].max()) if away.any() else 0.0
     shift = 0.0
     if 0 < k < len(near) - 1:

@@ -102,6 +102,7 @@ def solve(count: int, ties: Sequence[Tie], reference: int = 0, skew_sigma_s: flo
         if worst is None:
             rate_sigma = np.where(clocks.rate_sigma < KNOWN_RATE, RATE_SIGMA, _FIXED)
             final, _ = _fit(count, kept, reference, skew_sigma_s, rate_sigma)
+            final.offsets_s[:] += 0.0  # no negative zero
             return replace(final, rate_sigma=clocks.rate_sigma, dropped=tuple(dropped))
         dropped.append(worst)
         kept = [tie for tie in kept if (tie.i, tie.j, tie.kind) != worst]
