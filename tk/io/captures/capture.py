@@ -18,6 +18,7 @@ from tk.io.captures.capture_toml import CaptureSettings, GivenSubject, read_sett
 from tk.io.captures.clip import Clip
 from tk.io.captures.clip_folder import clips_of, open_clips, open_masks, read_some
 from tk.io.captures.frames import FrameReader, FrameSet
+from tk.io.captures.session import inherited, is_session, trials
 from tk.io.captures.timing import check_clock, read_stamps
 from tk.io.captures.timing import resample as resampled
 from tk.io.captures.video import VideoClip, damaged_images, notes_on, odd_turn
@@ -159,7 +160,7 @@ class Capture:
             return os.path.relpath(self.mask_clips[0].path.parent, self.path)
         if self.masks == "median":
             return "median"
-        return "none" if (self.path / "background").is_dir() else ""
+        return "none" if inherited(self.path, "background").is_dir() else ""
 
     def setup(self) -> Setup:
         """Return what `calibration.toml` and `capture.toml` say about the scene."""
@@ -232,7 +233,7 @@ class Capture:
         Raises:
             VideoError: a camera has no background, or it cannot be read, or has another size.
         """
-        folder = self.path / "background"
+        folder = inherited(self.path, "background")
         if not folder.is_dir():
             return None
         clips = clips_of(self.calibration, folder, "background", "png", pictures=True)
@@ -263,12 +264,17 @@ def open_capture(
     path, masks_asked = Path(path), masks
     if not path.is_dir():
         raise CaptureError(f"{path}: is not a folder; a capture is a folder with calibration.toml and videos/")
-    calibration = read_calibration(path / "calibration.toml").select(cameras)
+    if is_session(path):
+        raise CaptureError(
+            f"{path}: is a session of {len(trials(path))} captures; give one of them, or track all of them: "
+            f"tk batch {path} -o FOLDER"
+        )
+    calibration = read_calibration(inherited(path, "calibration.toml")).select(cameras)
     rig = calibration.rig
     settings = read_settings(path / "capture.toml")
     clips = open_clips(calibration, path)
     mask_clips = open_masks(calibration, path, masks)
-    warnings: list[str] = [*calibration.notes, *notes_on(clips)]
+    warnings: list[str] = [*settings.inherited, *calibration.notes, *notes_on(clips)]
     if settings.unknown:
         warnings.append(f"{path / 'capture.toml'}: unknown keys are ignored: {', '.join(settings.unknown)}")
     _warn_of_units(calibration, warnings.append)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tk.errors import ConfigError, VolumeError
+from tk.io.captures.session import SESSION, described, merged, session_of
 from tk.io.toml import Table, load_toml
 from tk.model.cameras.up import up_text
 from tk.model.cameras.volume import Volume
@@ -65,6 +66,7 @@ class CaptureSettings:
         init_pose: one of :data:`INIT_POSES`.
         init_keypoints: folder of 2D keypoints of the first pose, relative to the capture's; None if there is none.
         unknown: unknown keys, for example misspelt ones.
+        inherited: notes about what comes from the session.
     """
 
     name: str | None = None
@@ -77,18 +79,30 @@ class CaptureSettings:
     init_pose: str = "da-vinci"
     init_keypoints: str | None = None
     unknown: tuple[str, ...] = ()
+    inherited: tuple[str, ...] = ()
 
 
 def read_settings(path: Path) -> CaptureSettings:
-    """Read `capture.toml`; a missing file counts as an empty one.
+    """Read `capture.toml`; a missing file counts as an empty one. A capture in a session inherits its settings.
 
     Raises:
         CaptureError: invalid TOML or a value out of range, with the file and the key.
         VolumeError: the working volume is empty.
     """
-    if not path.exists():
-        return CaptureSettings()
-    document = Table(load_toml(path), str(path))
+    own = load_toml(path) if path.exists() else {}
+    if (session := session_of(path.parent)) is None:
+        return _settings(path, own)
+    shared = _settings(session / SESSION, merged(path.parent, {}))  # before the trial's: its errors name its file
+    notes = described(path.parent, own)
+    if shared.unknown:
+        notes.append(f"{session / SESSION}: unknown keys are ignored: {', '.join(shared.unknown)}")
+    found = _settings(path, merged(path.parent, own))
+    return replace(found, unknown=_unknown_keys(own), inherited=tuple(notes))
+
+
+def _settings(path: Path, values: dict[str, Any]) -> CaptureSettings:
+    """Return the settings in a document; ``path``: the file that errors name."""
+    document = Table(values, str(path))
 
     fps = document.number("fps") if "fps" in document else None
     if fps is not None and fps <= 0:
