@@ -158,6 +158,17 @@ def test_without_a_board_on_the_floor_the_cameras_give_up(good: tuple[Calibrated
     assert np.degrees(np.arccos(up @ RIG[0].rotation @ np.array([0.0, 0, 1]))) < 3
 
 
+def test_copied_images_are_refused() -> None:
+    """Encoding again moves the points by some tenths of a pixel."""
+    first, second, _ = footages()
+    copied = see(RIG[0], {i: pose for i, pose in POSES.items() if i < 100}, 0, noise_px=0.3)
+    copied = replace(copied, name="cam3", path=second.path.with_name("cam3"))
+    with pytest.raises(
+        CalibrationError, match=r"camera cam3: has the same images as camera cam1: .* was a file copied"
+    ):
+        run([first, second, copied])
+
+
 def test_one_camera_has_intrinsics_only() -> None:
     done, verdict = run(footages()[:1])
     assert abs(done.rig[0].matrix[0, 0] / RIG[0].matrix[0, 0] - 1) < 0.003

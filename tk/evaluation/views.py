@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError, ConfigError
 from tk.evaluation.joints import plain_values
 from tk.io.captures.capture import Capture, open_capture
+from tk.io.captures.session import inherited
 from tk.io.results.data import Result
 from tk.io.results.reader import as_damage_error, read_joints, read_result
 from tk.model.body.joints import ANKLE_JOINTS, JOINTS
@@ -183,7 +184,7 @@ def _silhouette_errors(result: Result, capture: Capture) -> tuple[list[float] | 
 def capture_of(truth: str | os.PathLike[str]) -> Path | None:
     """Return the capture folder that contains the ground truth file; None if there is none."""
     folder = Path(truth).parent
-    return folder if (folder / "calibration.toml").is_file() else None
+    return folder if inherited(folder, "calibration.toml").is_file() else None
 
 
 def _percent(value: float | None) -> str:

@@ -20,7 +20,8 @@ from tk.io.toml import load_toml
 
 #: files and folders of a capture that tk reads
 _CAPTURE_PARTS = (
-    "calibration.toml", "capture.toml", "truth.h5", "videos", "images", "background", "masks", "timestamps",
+    "calibration.toml", "capture.toml", "session.toml", "truth.h5", "videos", "images", "background", "masks",
+    "timestamps",
 )  # fmt: skip
 
 

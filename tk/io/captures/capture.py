@@ -21,6 +21,7 @@ from tk.io.captures.clock import Clock, OnClock, put_on_clock
 from tk.io.captures.frames import FrameReader, FrameSet
 from tk.io.captures.referred import referred_clips, referred_stamps
 from tk.io.captures.scene import up_of, volume_of, warn_of_units
+from tk.io.captures.session import inherited, is_session, trials
 from tk.io.captures.timing import Stamps, check_clock, read_stamps
 from tk.io.captures.video import VideoClip, damaged_images, notes_on, odd_turn
 from tk.io.paths import text_of
@@ -168,7 +169,7 @@ class Capture:
             return os.path.relpath(self.mask_clips[0].path.parent, self.path)
         if self.masks == "median":
             return "median"
-        return "none" if self.empty_clips or (self.path / "background").is_dir() else ""
+        return "none" if self.empty_clips or inherited(self.path, "background").is_dir() else ""
 
     def setup(self) -> Setup:
         """Return what `calibration.toml` and `capture.toml` say about the scene."""
@@ -251,7 +252,7 @@ class Capture:
         Raises:
             VideoError: a camera has no background, or it cannot be read, or has another size.
         """
-        folder, small = self.path / "background", self.empty_clips
+        folder, small = inherited(self.path, "background"), self.empty_clips
         if small is None and not folder.is_dir():
             return None
         if small is None:
@@ -283,7 +284,12 @@ def open_capture(
     path, masks_asked = Path(path), masks
     if not path.is_dir():
         raise CaptureError(f"{path}: is not a folder; a capture is a folder with calibration.toml and videos/")
-    known = read_calibration(path / "calibration.toml")
+    if is_session(path):
+        raise CaptureError(
+            f"{path}: is a session of {len(trials(path))} captures; give one of them, or track all of them: "
+            f"tk batch {path} -o FOLDER"
+        )
+    known = read_calibration(inherited(path, "calibration.toml"))
     calibration, file = known.select(cameras), path / "capture.toml"
     rig = calibration.rig
     settings = read_settings(file)
@@ -295,7 +301,7 @@ def open_capture(
         clips = open_clips(calibration, path)
         stamps = read_stamps(path, calibration, clips, regular)
     mask_clips = open_masks(calibration, path, masks)
-    warnings: list[str] = [*calibration.notes, *notes_on(clips)]
+    warnings: list[str] = [*settings.inherited, *calibration.notes, *notes_on(clips)]
     if settings.unknown:
         warnings.append(f"{file}: unknown keys are ignored: {', '.join(settings.unknown)}")
     warn_of_units(calibration, warnings.append)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tk.errors import ConfigError, VolumeError
+from tk.io.captures.session import SESSION, described, merged, session_of
 from tk.io.toml import Table, load_toml
 from tk.model.cameras.up import up_text
 from tk.model.cameras.volume import Volume
@@ -99,6 +100,7 @@ class CaptureSettings:
         videos: the videos that are not in `videos/`, by name.
         span: the part of the recording that is used.
         unknown: unknown keys, for example misspelt ones.
+        inherited: notes about what comes from the session.
     """
 
     name: str | None = None
@@ -113,18 +115,30 @@ class CaptureSettings:
     videos: Mapping[str, GivenVideo] = field(default_factory=dict)
     span: Span = Span()
     unknown: tuple[str, ...] = ()
+    inherited: tuple[str, ...] = ()
 
 
 def read_settings(path: Path) -> CaptureSettings:
-    """Read `capture.toml`; a missing file counts as an empty one.
+    """Read `capture.toml`; a missing file counts as an empty one. A capture in a session inherits its settings.
 
     Raises:
         CaptureError: invalid TOML or a value out of range, with the file and the key.
         VolumeError: the working volume is empty.
     """
-    if not path.exists():
-        return CaptureSettings()
-    document = Table(load_toml(path), str(path))
+    own = load_toml(path) if path.exists() else {}
+    if (session := session_of(path.parent)) is None:
+        return _settings(path, own)
+    shared = _settings(session / SESSION, merged(path.parent, {}))  # before the trial's: its errors name its file
+    notes = described(path.parent, own)
+    if shared.unknown:
+        notes.append(f"{session / SESSION}: unknown keys are ignored: {', '.join(shared.unknown)}")
+    found = _settings(path, merged(path.parent, own))
+    return replace(found, unknown=_unknown_keys(own), inherited=tuple(notes))
+
+
+def _settings(path: Path, values: dict[str, Any]) -> CaptureSettings:
+    """Return the settings in a document; ``path``: the file that errors name."""
+    document = Table(values, str(path))
 
     fps = document.number("fps") if "fps" in document else None
     if fps is not None and fps <= 0:
