@@ -10,6 +10,7 @@ import os
 import re
 import shutil
 import signal
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -150,6 +151,15 @@ def tk(capfd: pytest.CaptureFixture[str]) -> Tk:
         return Ran(code if isinstance(code, int) else int(code is not None), said.out, said.err)
 
     return run
+
+
+def run_clock(monkeypatch: pytest.MonkeyPatch, speed: float) -> None:
+    """Let the clock of this process run faster or slower. A run writes its rows every half second of it."""
+    clock = time.perf_counter
+    monkeypatch.setattr(time, "perf_counter", lambda: speed * clock())
+
+
+EVERY_FRAME = 1e6  # speed of the clock with which a run writes every frame at once
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:

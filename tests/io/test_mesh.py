@@ -47,7 +47,7 @@ def test_mesh_of_a_ball_has_its_place_volume_and_colours() -> None:
     assert (mesh.colors[high] == [0, 0, 255]).all()
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.05, 0.95))
 def test_any_voxels_have_a_closed_surface(seed: int, share: float) -> None:
     """Whether they touch the border of the volume, or each other by a corner only."""

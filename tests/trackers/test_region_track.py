@@ -177,7 +177,7 @@ def test_a_killed_causal_run_is_resumed_and_equals_an_uninterrupted_one(
 ) -> None:
     result = tmp_path / "r.h5"
     command = ["track", tiny, "-o", result, "--config", quick, "--causal"]
-    killed = send(signal.SIGKILL, 5, *command, write_every_s=0.05)
+    killed = send(signal.SIGKILL, 5, *command, clock=10.0)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert killed.stdout == ""
     done = len(read_result(result).frames)  # frames that are written together may be more than those reported
