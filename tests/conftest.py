@@ -205,6 +205,17 @@ def tracked(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def causal(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The result, read-only, of an uninterrupted first pass of the default method over the rendered capture."""
+    from tk.io.captures.capture import open_capture
+
+    def make(path: Path) -> None:
+        assert track(open_capture(tiny), path, settings_file.from_toml(QUICK), causal=True).lost == 0
+
+    return made_once(tmp_path_factory, "causal.h5", make)
+
+
+@pytest.fixture(scope="session")
 def quick(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A settings file with :data:`QUICK`, for ``--config``."""
     path = tmp_path_factory.mktemp("settings") / "quick.toml"

@@ -129,11 +129,15 @@ def test_files_of_other_programs_are_not_replaced(complete: Path, tiny: Path, tm
 
 
 @pytest.mark.parametrize(
-    "error",
-    [ExportError("no encoder here"), RuntimeError("a defect\nof ours"), OSError(28, "full")],
+    ("name", "error"),
+    [
+        ("check_encoder", ExportError("no encoder here")),
+        ("shot", RuntimeError("a defect\nof ours")),
+        ("build_page", OSError(28, "full")),
+    ],
 )
 def test_failure_is_one_warning_line(
-    error: BaseException, complete: Path, tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, error: BaseException, complete: Path, tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> None:
         raise error
@@ -141,12 +145,10 @@ def test_failure_is_one_warning_line(
     result = tmp_path / "walk.h5"
     result.write_bytes(complete.read_bytes())
     before = result.read_bytes()
-    for name in ("check_encoder", "shot", "build_page"):
-        with monkeypatch.context() as patched:
-            patched.setattr(after, name, fail)
-            warnings: list[str] = []
-            write_video_and_report(open_capture(tiny), result, warnings.append)
-        (warning,) = warnings
-        assert "no overlay video and report: " in warning and "\n" not in warning
-        assert result.read_bytes() == before
-        assert {path.name for path in tmp_path.iterdir()} <= {"walk.h5", "walk.mp4"}
+    monkeypatch.setattr(after, name, fail)
+    warnings: list[str] = []
+    write_video_and_report(open_capture(tiny), result, warnings.append)
+    (warning,) = warnings
+    assert "no overlay video and report: " in warning and "\n" not in warning
+    assert result.read_bytes() == before
+    assert {path.name for path in tmp_path.iterdir()} <= {"walk.h5", "walk.mp4"}
