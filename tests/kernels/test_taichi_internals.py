@@ -7,8 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from tests.kernels.test_runtime import run
 from tk.kernels import taichi_internals
@@ -174,16 +172,6 @@ def test_the_source_of_a_function_is_read_once(monkeypatch):
     monkeypatch.setattr(inspect, "getsourcelines", lambda function: read.append(function) or original(function))
     assert _eight_times(5) == 40
     assert sorted(function.__name__ for function in read) == ["_eight_times", "_twice"]
-
-
-@settings(max_examples=200)
-@given(line=st.text(st.sampled_from(" \t\n\x0bab#é"), max_size=30))
-def test_lines_are_filled_as_by_textwrap(line):
-    assert taichi_internals._fill(line, tabsize=4, width=9999) == textwrap.fill(line, tabsize=4, width=9999)
-
-
-def test_a_long_line_is_wrapped_by_textwrap():
-    assert taichi_internals._fill("ab cd", width=3) == "ab\ncd"
 
 
 @pytest.mark.parametrize(
