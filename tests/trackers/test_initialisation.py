@@ -127,9 +127,7 @@ def test_poses_with_similar_costs_in_one_frame_all_become_hypotheses(monkeypatch
     monkeypatch.setattr(
         tracker, "settle", lambda _, starts, *__: BatchSolution(np.array(starts), np.zeros(0), np.zeros(3, np.int32))
     )
-    monkeypatch.setattr("tk.trackers.initialisation.gait.hypotheses", lambda *_: np.array([wrong, right]))
-    monkeypatch.setattr("tk.trackers.initialisation.REFINED", 1)
-    monkeypatch.setattr("tk.trackers.initialisation._searched", lambda _, __, ___, pose: pose)
+    monkeypatch.setattr("tk.trackers.initialisation.gait.hypotheses", lambda *_: np.array([wrong, *3 * [right]]))
     costs = {False: 20.0, True: 20.5}
     monkeypatch.setattr(tracker, "score", lambda _, poses, __: np.array([costs[np.allclose(p, right)] for p in poses]))
     monkeypatch.setattr(tracker, "mean_residual", lambda _, poses, __: np.full(len(poses), 0.21))

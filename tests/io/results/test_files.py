@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
 import signal
@@ -19,7 +20,6 @@ import pytest
 from tests.io.result_files import append, assert_complete, fail_after, resume, write
 from tests.io.result_victim import META
 from tk.errors import ResultError, TkError
-from tk.io import hdf5_writer
 from tk.io.results.reader import read_joints, read_result
 from tk.io.results.writer import ResultWriter
 
@@ -239,14 +239,18 @@ def test_run_is_resumable_whenever_a_write_fails(path: Path, monkeypatch: pytest
 
 
 def test_interruption_while_hdf5_writes_takes_effect_afterwards(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(*arguments: Any) -> None:
-        os.kill(os.getpid(), signal.SIGINT)
-        original(*arguments)
+    pressed: list[bool] = []
 
-    original = hdf5_writer._write
+    class File(io.FileIO):
+        def write(self, data: Any) -> int:
+            if pressed:
+                os.kill(os.getpid(), signal.SIGINT)
+            return super().write(data)
+
+    monkeypatch.setattr(io, "FileIO", File)
     with pytest.raises(KeyboardInterrupt), ResultWriter.create(path, META) as writer:
         append(writer, 0)
-        monkeypatch.setattr(hdf5_writer, "_write", interrupt)
+        pressed.append(True)
         append(writer, 1)
     assert assert_complete(path, 2) == 2
 
