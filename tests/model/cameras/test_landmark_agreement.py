@@ -131,3 +131,46 @@ def test_no_camera_agrees_without_a_pair_that_shows_one_person() -> None:
     alone[1] = landmarks_of(RIG, BODY, POSES[0], 0.02)[1]
     agree, points, _ = consensus(RIG, alone)
     assert not agree.any() and np.isnan(points).all()
+
+
+# --- what other images leave open ---------------------------------------------------------------------------------
+
+
+def without(sets: np.ndarray, *cameras: int) -> np.ndarray:
+    """Return the landmarks (C, L, 3) without those of some cameras."""
+    result = sets.copy()
+    result[list(cameras)] = np.nan
+    return result
+
+
+def test_cameras_that_face_each_other_do_not_contradict_a_third_one() -> None:
+    for seed in range(5):
+        one = without(landmarks_of(RIG, BODY, POSES[0], 0.05, seed=seed), 3)  # cameras 0 and 2 are opposite
+        assert (evidence_for_cameras(RIG, [one[None]])[:3] > 0).all()
+
+
+def test_set_of_somebody_else_does_not_contradict_the_cameras_that_agree() -> None:
+    below = POSES[1].copy()
+    below[:3] += [0.45, 0.3, -0.5]  # at one height, each two cameras would agree on a point between both people
+    one, other = (landmarks_of(RIG, BODY, pose, 0.02, seed=1)[[0, 1, 3]] for pose in (POSES[0], below))
+    three = Rig(tuple(RIG[c] for c in (0, 1, 3)))
+    mixed = one.copy()
+    mixed[2] = other[2]
+    evidence = evidence_for_cameras(three, [mixed[None]])
+    assert evidence[2] < 0 and not (evidence[:2] < 0).any()
+    found = associated(three, np.stack([mixed]))[0]
+    assert np.isnan(found[2]).all() and np.isfinite(found[:2]).all()
+
+
+def test_wrong_landmarks_of_another_image_are_not_held_against_a_camera() -> None:
+    one = landmarks_of(RIG, BODY, POSES[0], 0.02)
+    wrong = one.copy()
+    wrong[0, :6, :2] += 60.0
+    right, doubtful = (evidence_for_cameras(RIG, [without(sets, 3)[None]])[1] for sets in (one, wrong))
+    assert right > doubtful > 0
+
+
+def test_unknown_place_says_nothing() -> None:
+    away, visible = np.full((21, 2), 0.3), np.full(21, 0.95)
+    known, unknown = (log_ratio(away, visible, np.tile(spread * np.eye(2), (21, 1, 1))) for spread in (1e-6, 100.0))
+    assert known < -10 and abs(unknown) < 1.0
