@@ -158,8 +158,11 @@ def run_raw(folder: Path, force: bool, quiet: bool, no_report: bool) -> None:
     Raises:
         CaptureError: the folder exists, and ``force`` is False.
     """
-    from tk.cli import main
+    from tk.commands.calibrate import calibrate
+    from tk.commands.sync import sync
+    from tk.commands.track import track
 
+    commands: dict[str, click.Command] = {"sync": sync, "calibrate": calibrate, "track": track}
     if folder.exists():
         if not force:
             raise CaptureError(f"{folder}: exists; add --force to replace what an earlier tk demo --raw wrote")
@@ -179,7 +182,8 @@ def run_raw(folder: Path, force: bool, quiet: bool, no_report: bool) -> None:
     for line in lines:
         words = [str(word) for word in line]
         click.echo(f"\n$ tk {shlex.join(words)}")
-        if main.main([*words, *(["--quiet"] if quiet else [])], standalone_mode=False):
+        quietly = ["--quiet"] if quiet else []
+        if commands[words[0]].main([*words[1:], *quietly], f"tk {words[0]}", standalone_mode=False):
             return
     with as_file(files("tk") / "data" / "demo" / "truth.h5") as truth:
         from tk.evaluation.joints import evaluate_files
