@@ -75,15 +75,15 @@ def sync(raw: Path, output: Path, **given: Any) -> None:
         from tk.synchronise.capture_file import check_capture, write_capture
         from tk.synchronise.decide import refused
         from tk.synchronise.raw import read_cameras, read_raw
-        from tk.synchronise.run import WAYS, by_hand, synchronise
+        from tk.synchronise.run import METHODS, by_hand, synchronise
         from tk.synchronise.sheet import fastest_instants, write_sheet
         from tk.synchronise.text import chosen_span, empty_part, table, to_dict, without_empty
         from tk.threads import one_thread
 
-        ways = given["by"] or WAYS
-        for way in ways:
-            if way not in WAYS:
-                raise ConfigError(f"--by {way}: must be one of {', '.join(WAYS)}")
+        methods = given["by"] or METHODS
+        for method in methods:
+            if method not in METHODS:
+                raise ConfigError(f"--by {method}: must be one of {', '.join(METHODS)}")
         fps = given["fps"]
         if fps is not None and not 0.1 <= fps <= 1000:
             raise ConfigError(f"--fps {fps:g}: must be between 0.1 and 1000")
@@ -94,7 +94,7 @@ def sync(raw: Path, output: Path, **given: Any) -> None:
             if given["offsets"] is not None:
                 done = by_hand(recordings, given["offsets"], given["begin"])
             else:
-                done = synchronise(recordings, cameras, ways, given["begin"], reporter.stage)
+                done = synchronise(recordings, cameras, methods, given["begin"], reporter.stage)
             if done.decision.unsure:
                 _print(done, given["as_json"])
                 raise refused(recordings, done.decision)

@@ -142,7 +142,7 @@ def _differences(
         members = np.flatnonzero(both).tolist()
         if len(members) < 2 or members[0] != root:
             continue
-        # the skew of the sound is what is looked for
+        # the skew of the sound is estimated
         a, b = (solve(count, ties, root, skew_sigma_s=1e-9) for ties in (one, other))
         middle = [float(np.mean(recordings[c].span)) for c in members]
         apart = np.array([b.common(c, at) - a.common(c, at) for c, at in zip(members, middle, strict=True)])

@@ -14,8 +14,8 @@ from tk.synchronise.ties import Tie
 
 Float = NDArray[np.float64]
 
-#: a change counts as sudden if it is so many times the usual change from image to image, and above these grey levels
-_TIMES_USUAL, _LEAST = 8.0, 4.0
+#: a change counts as sudden if it is so many times the common change from image to image, and above these grey levels
+_TIMES_COMMON, _LEAST = 8.0, 4.0
 #: share of the image that becomes brighter, or darker, by half the mean change: light, not somebody near a camera
 _SHARE = 0.5
 #: most changes of a recording that are compared; a disco is none
@@ -40,8 +40,8 @@ class Event:
 def find_events(look: Look) -> list[Event]:
     """Return the sudden changes of the light of a recording, in order."""
     steps = np.diff(look.brightness)
-    usual = 1.4826 * float(np.median(np.abs(steps - np.median(steps)))) + 0.05
-    large = np.abs(steps) > max(_TIMES_USUAL * usual, _LEAST)
+    common = 1.4826 * float(np.median(np.abs(steps - np.median(steps)))) + 0.05
+    large = np.abs(steps) > max(_TIMES_COMMON * common, _LEAST)
     events = []
     k = 0
     while k < len(steps):
@@ -49,7 +49,7 @@ def find_events(look: Look) -> list[Event]:
             k += 1
             continue
         last = k  # a change that two images share
-        if k + 1 < len(steps) and np.sign(steps[k + 1]) == np.sign(steps[k]) and abs(steps[k + 1]) > 3 * usual:
+        if k + 1 < len(steps) and np.sign(steps[k + 1]) == np.sign(steps[k]) and abs(steps[k + 1]) > 3 * common:
             last = k + 1
         if (event := _event(look, k, last)) is not None:
             events.append(event)

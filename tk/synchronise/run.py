@@ -21,8 +21,8 @@ from tk.synchronise.ties import Clocks, Tie, connected_to
 
 Float = NDArray[np.float64]
 
-#: ways to find offsets that the user can choose from
-WAYS = ("sound", "flash", "person", "timecode")
+#: methods that find offsets; the user can choose
+METHODS = ("sound", "flash", "person", "timecode")
 #: a camera's lag is certain if the mean significance over its pairs is above this, and above that of its second best
 #: lag by this factor; without and with known cameras
 _SURE, _SECOND = {"person": 5.0, "cameras": 6.0}, {"person": 1.35, "cameras": 1.25}
@@ -54,7 +54,7 @@ class Synchronised:
 def synchronise(
     recordings: list[Recording],
     cameras: Sequence[Camera] = (),
-    ways: Sequence[str] = WAYS,
+    methods: Sequence[str] = METHODS,
     begin_s: float | None = None,
     progress: Callable[[str], object] = str,
 ) -> Synchronised:
@@ -63,7 +63,7 @@ def synchronise(
     Args:
         recordings: the cameras; the first is the reference.
         cameras: their calibration; empty if it is unknown.
-        ways: methods of :data:`WAYS` that are used.
+        methods: methods of :data:`METHODS` that are used.
         begin_s: own time of the first camera at which pictures are looked at; None: at its start.
         progress: called with what is done next.
 
@@ -73,7 +73,7 @@ def synchronise(
     count = len(recordings)
     ties: list[Tie] = []
     reasons: dict[int, list[str]] = {c: [] for c in range(count)}
-    if "sound" in ways:
+    if "sound" in methods:
         progress("comparing the sound")
         with ThreadPoolExecutor(2) as threads:
             tracks = list(threads.map(read_track, recordings))
@@ -85,10 +85,10 @@ def synchronise(
             silent = tracks[c] is None or tracks[c].silent
             reasons[c].append("it has no sound" if silent else "its sound is another one")
     looks = _look(recordings, ties, begin_s, progress)
-    if "flash" in ways:
+    if "flash" in methods:
         ties += compare_events(looks)
     mirrored: list[int] = []
-    if "person" in ways:
+    if "person" in methods:
         progress("comparing what moves")
         kind = "cameras" if cameras else "person"
         pairs = compare_planes(looks, cameras) if cameras else compare_signals(looks)
@@ -100,7 +100,7 @@ def synchronise(
         for c in np.flatnonzero(~sure).tolist():
             still = "nothing moves in it" if not looks[c].changes.any() else "its motion fits none of the others"
             reasons[c].append("its picture is mirrored" if c in mirrored else still)
-    if "timecode" in ways:
+    if "timecode" in methods:
         ties += timecode_ties(recordings)
     decision = decide(recordings, ties, reasons)
     for c in mirrored:

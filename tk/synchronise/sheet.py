@@ -22,7 +22,7 @@ Image = NDArray[np.uint8]
 
 #: height of a picture, of the text above a row, and most width of a picture, pixels
 _HEIGHT, _LINE, _MOST_WIDTH = 300, 26, 540
-#: instants, and seconds between them and the fastest one; 1/s: clock on which it is looked for
+#: instants, and seconds between them and the fastest one; 1/s: clock on which it is found
 _INSTANTS, _APART_S, _HZ = 3, 0.3, 30.0
 
 

@@ -455,4 +455,4 @@ def test_theia_axes_are_found_from_the_cameras(folder: Path, check: Import, tran
 def test_usual_reading_of_qualisys_needs_no_note(folder: Path) -> None:
     write_qca(folder / "session.qca.txt", make_rig())
     clips(folder)
-    assert not any("read as usual" in note for note in read_project(folder).notes)
+    assert not any("in the first reading" in note for note in read_project(folder).notes)

@@ -1,4 +1,4 @@
-"""Choose between ways to read the poses of a format whose public description leaves them open.
+"""Choose between readings of the poses of a format whose public description leaves them open.
 
 The cameras of a motion capture look at one place. Read in a wrong way, they look past each other, or away from it.
 """
@@ -25,11 +25,11 @@ Reading = Callable[[Float, Float], tuple[Float, Float]]
 Y_UP = np.diag([1.0, -1.0, -1.0])
 
 #: degrees between a camera's axis and the direction to the place that all cameras look at, root mean square: half the
-#: field of view of a wide lens. The usual reading is replaced if it has more, and another one half as much.
-_ASTRAY_DEG = 45.0
-#: most of it, degrees, of another reading that replaces the usual one because its cameras are upright: poses that are
+#: field of view of a wide lens. The first reading is replaced if it has more, and another one half as much.
+_APART_DEG = 45.0
+#: most of it, degrees, of another reading that replaces the first one because its cameras are upright: poses that are
 #: read in a wrong way may by chance look at one place, but not upright
-_UPRIGHT_ASTRAY_DEG = 20.0
+_UPRIGHT_APART_DEG = 20.0
 
 
 def to_camera(R: Float, v: Float) -> tuple[Float, Float]:
@@ -62,10 +62,10 @@ def choose(found: Tables, readings: Mapping[str, Reading]) -> None:
 
     Args:
         found: cameras whose `rotation` is R, a matrix, and whose `translation` is v, as the file has them.
-        readings: by what they say about the file, the usual one first.
+        readings: by what they say about the file, the first one first.
 
     Raises:
-        CalibrationError: the usual reading is implausible, and several others are equally plausible.
+        CalibrationError: the first reading is implausible, and several others are equally plausible.
     """
     if not found.cameras:
         return  # read_format says so
@@ -76,25 +76,25 @@ def choose(found: Tables, readings: Mapping[str, Reading]) -> None:
     if any(not np.isfinite(R).all() or np.linalg.matrix_rank(R) < 3 or not np.isfinite(v).all() for R, v in raw):
         return  # calibration_of says what is wrong
     poses = {name: [read(R, v) for R, v in raw] for name, read in readings.items()}
-    astray = {name: _astray_deg(of_all) for name, of_all in poses.items()}
-    usual = best = next(iter(readings))
-    closer = sorted(set(readings) - {usual}, key=lambda name: astray[name])
-    if astray[usual] > _ASTRAY_DEG:
-        closer = [name for name in closer if astray[name] < min(_ASTRAY_DEG, astray[usual] / 2)]
-    elif _upright(poses[usual]):
+    apart = {name: _apart_deg(of_all) for name, of_all in poses.items()}
+    first = best = next(iter(readings))
+    closer = sorted(set(readings) - {first}, key=lambda name: apart[name])
+    if apart[first] > _APART_DEG:
+        closer = [name for name in closer if apart[name] < min(_APART_DEG, apart[first] / 2)]
+    elif _upright(poses[first]):
         closer = []
     else:
-        closer = [name for name in closer if astray[name] < _UPRIGHT_ASTRAY_DEG and _upright(poses[name])]
-    if len(closer) > 1 and astray[closer[1]] < 1.5 * astray[closer[0]] + 1.0:
+        closer = [name for name in closer if apart[name] < _UPRIGHT_APART_DEG and _upright(poses[name])]
+    if len(closer) > 1 and apart[closer[1]] < 1.5 * apart[closer[0]] + 1.0:
         raise CalibrationError(
-            f"{found.source}: as usual ({usual}), its cameras look past each other, or lie on their side; they do "
-            f"not if {closer[0]}, and if {closer[1]}: write calibration.toml, where this is fixed"
+            f"{found.source}: in the first reading ({first}), its cameras look past each other, or lie on their side; "
+            f"they do not if {closer[0]}, and if {closer[1]}: write calibration.toml, where this is fixed"
         )
-    best = closer[0] if closer else usual
-    if best != usual:
+    best = closer[0] if closer else first
+    if best != first:
         found.notes.append(
-            f"{found.source}: {best}: read as usual ({usual}), the cameras would look past each other, or lie on "
-            "their side; look at them with tk inspect"
+            f"{found.source}: {best}: in the first reading ({first}), the cameras would look past each other, or "
+            "lie on their side; look at them with tk inspect"
         )
     for (key, table), (rotation, translation) in zip(list(found.cameras.items()), poses[best], strict=True):
         found.cameras[key] = {**table, "rotation": rotation.tolist(), "translation": translation.tolist()}
@@ -105,7 +105,7 @@ def _upright(poses: list[tuple[Float, Float]]) -> bool:
     return infer_up(Rig(tuple(Camera("", 2, 2, np.eye(3), np.zeros(5), R, t) for R, t in poses))).sure
 
 
-def _astray_deg(poses: list[tuple[Float, Float]]) -> float:
+def _apart_deg(poses: list[tuple[Float, Float]]) -> float:
     """Return the angle between the cameras' axes and the direction to the point nearest to all axes, degrees, root
     mean square; 0 if the axes are parallel, which shows nothing."""
     centers = np.array([-R.T @ t for R, t in poses])
