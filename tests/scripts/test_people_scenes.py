@@ -90,7 +90,7 @@ def test_truth_has_rows_only_while_a_person_is_in_the_volume(tmp_path: Path, mon
 
 @pytest.mark.parametrize("name", TWO)
 def test_people_of_a_scene_meet_without_walking_through_each_other(name: str) -> None:
-    plan = plan_capture(Options(name, cameras=5, size=(80, 60)))
+    plan = plan_capture(Options(name, cameras=5, size=(160, 120)))
     a, b = plan.people.values()
     apart = np.linalg.norm(a.joints[:, JOINTS.index("pelvis")] - b.joints[:, JOINTS.index("pelvis")], axis=1)
     embraced = apart < 0.45

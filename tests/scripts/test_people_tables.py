@@ -12,7 +12,7 @@ import pytest
 
 from scripts import people_scenes
 from scripts.people_scenes import Run, compare_together, embraces, main, outside
-from tests.conftest import QUICK
+from tests.conftest import FITTED
 from tk.io.results.data import JointTrack
 from tk.io.results.reader import read_people
 from tk.model.body.joints import JOINTS
@@ -49,9 +49,9 @@ def test_bystander_scene_is_tracked_and_compared(
     scene.mkdir(parents=True)
     for name in ("with", "without"):
         (scene / name).symlink_to(tiny)
-    config = tmp_path / "quick.toml"
-    config.write_text(QUICK, encoding="utf-8")
-    main([str(tmp_path / "scenes"), "--work", str(tmp_path / "work"), "--config", str(config), "--frames", "0:3"])
+    config = tmp_path / "fitted.toml"
+    config.write_text(FITTED, encoding="utf-8")
+    main([str(tmp_path / "scenes"), "--work", str(tmp_path / "work"), "--config", str(config), "--frames", "0:5"])
     name, limbs, without, difference, *_, missed, missed_without = capsys.readouterr().out.splitlines()[-1].split()
     assert name == "still"
     assert 0 < float(limbs) < 10
