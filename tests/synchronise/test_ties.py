@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.model.ring import ring_of_cameras
+from tk.synchronise.run import SOUND_M_S, without_travel_time
 from tk.synchronise.ties import KNOWN_RATE, Tie, solve
 
 OFFSETS = [0.0, 12.5, -3.25, 40.0]
@@ -56,3 +58,12 @@ def test_skew_between_sound_and_pictures_is_estimated() -> None:
     clocks = solve(4, [*late, *ties()])
     assert clocks.offsets_s == pytest.approx(OFFSETS, abs=1e-3)
     assert clocks.skew_s[2] - np.median(clocks.skew_s) == pytest.approx(0.03, abs=0.002)
+
+
+def test_known_cameras_correct_the_travel_time_of_sound() -> None:
+    cameras = [*ring_of_cameras(3, 160, 200, 3.0)][:2] + [ring_of_cameras(3, 160, 200, 9.0)[2]]
+    far = np.array([np.linalg.norm(camera.center - [0.0, 0.0, 1.0]) for camera in cameras]) / SOUND_M_S
+    heard = Tie(0, 2, 10.0 + far[0], 7.0 + far[2], 0.001, "sound")
+    tie = without_travel_time([heard], cameras)[0]
+    assert tie.own_i - tie.own_j == pytest.approx(3.0, abs=1e-6)
+    assert abs(heard.own_i - heard.own_j - 3.0) > 0.01

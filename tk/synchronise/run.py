@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError, VideoError
 from tk.model.cameras.camera import Camera
+from tk.model.cameras.common_view import closest_to_lines
 from tk.synchronise.decide import Decision, decide, timecode_ties
 from tk.synchronise.flash import compare_events
 from tk.synchronise.looks import LOOKED_S, Look, look_at
@@ -28,6 +29,8 @@ METHODS = ("sound", "flash", "person", "timecode")
 _SURE, _SECOND = {"person": 5.0, "cameras": 6.0}, {"person": 1.35, "cameras": 1.25}
 #: a mirrored image fits better than the image by this factor
 _MIRRORED = 1.5
+#: speed of sound in air, m/s
+SOUND_M_S = 343.0
 
 
 @dataclass
@@ -79,6 +82,8 @@ def synchronise(
             tracks = list(threads.map(read_track, recordings))
         heard = hear(tracks)
         found = [tie for each in heard.values() for tie in each.ties]
+        if cameras:
+            found = without_travel_time(found, cameras)
         ties += found
         linked = connected_to(0, count, [(tie.i, tie.j) for tie in found])
         for c in np.flatnonzero(~linked).tolist():
@@ -106,6 +111,17 @@ def synchronise(
     for c in mirrored:
         decision.unsure[c] = "its picture is mirrored, by the calibration; turn mirroring off in the camera"
     return Synchronised(recordings, decision, looks, mirrored)
+
+
+def without_travel_time(ties: list[Tie], cameras: Sequence[Camera]) -> list[Tie]:
+    """Return ties of sound as if it had been made at each camera: it comes from where all cameras look at, to some
+    metres."""
+    centers = np.array([camera.center for camera in cameras])
+    middle = closest_to_lines(centers, np.array([camera.rotation[2] for camera in cameras]))
+    if middle is None:
+        return ties
+    travel_s = np.linalg.norm(centers - middle, axis=1) / SOUND_M_S
+    return [replace(tie, own_i=tie.own_i - travel_s[tie.i], own_j=tie.own_j - travel_s[tie.j]) for tie in ties]
 
 
 def by_hand(recordings: list[Recording], offsets_s: dict[str, float], begin_s: float | None) -> Synchronised:

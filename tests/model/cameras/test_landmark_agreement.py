@@ -144,9 +144,13 @@ def without(sets: np.ndarray, *cameras: int) -> np.ndarray:
 
 
 def test_cameras_that_face_each_other_do_not_contradict_a_third_one() -> None:
+    half_turn = np.diag([-1.0, -1.0, 1.0])
+    facing = replace(RIG[0], name="facing", rotation=RIG[0].rotation @ half_turn)
+    rig = Rig((RIG[0], facing, RIG[1]))
+    np.testing.assert_allclose(facing.center[:2], -RIG[0].center[:2], atol=1e-9)
     for seed in range(5):
-        one = without(landmarks_of(RIG, BODY, POSES[0], 0.05, seed=seed), 3)  # cameras 0 and 2 are opposite
-        assert (evidence_for_cameras(RIG, [one[None]])[:3] > 0).all()
+        one = landmarks_of(rig, BODY, POSES[0], 0.05, seed=seed)
+        assert (evidence_for_cameras(rig, [one[None]]) > 0).all()
 
 
 def test_set_of_somebody_else_does_not_contradict_the_cameras_that_agree() -> None:
