@@ -61,7 +61,8 @@ def test_skew_between_sound_and_pictures_is_estimated() -> None:
 
 
 def test_known_cameras_correct_the_travel_time_of_sound() -> None:
-    cameras = [*ring_of_cameras(3, 160, 200, 3.0)][:2] + [ring_of_cameras(3, 160, 200, 9.0)[2]]
+    near, far_off = (list(ring_of_cameras(3, 160, 200, radius)) for radius in (3.0, 9.0))
+    cameras = [*near[:2], far_off[2]]
     far = np.array([np.linalg.norm(camera.center - [0.0, 0.0, 1.0]) for camera in cameras]) / SOUND_M_S
     heard = Tie(0, 2, 10.0 + far[0], 7.0 + far[2], 0.001, "sound")
     tie = without_travel_time([heard], cameras)[0]
