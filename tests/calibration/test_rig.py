@@ -126,6 +126,16 @@ def test_camera_that_was_moved_is_named() -> None:
     assert blamed and all(text.startswith("camera cam2") for text in blamed), verdict.reasons
 
 
+def test_two_cameras_that_agree_show_which_one_is_wrong(good: tuple[Calibrated, Verdict]) -> None:
+    done, _ = good
+    all_three = {i for i in done.world.state.boards if sum(view.instant == i for view in done.views) == 3}
+    wrong = max(range(3), key=lambda c: sum(view.camera == c for view in done.views))  # others are rarer, not wrong
+    dropped = tuple(view for view in done.views if view.camera == wrong and view.instant in all_three)
+    kept = tuple(view for view in done.views if all(view is not other for other in dropped))
+    verdict = judge(replace(done, views=kept, dropped=dropped))
+    assert [one.contradicting for one in verdict.cameras] == [len(dropped) if c == wrong else 0 for c in range(3)]
+
+
 def test_mirrored_camera_is_refused() -> None:
     """A chessboard looks alike in a mirror, so that only other cameras show it; a ChArUco board is not even found."""
     recorded = footages()

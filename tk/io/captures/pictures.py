@@ -119,5 +119,5 @@ def _has_end(coded: bytes) -> bool:
     if not coded:
         return False
     if coded.startswith(b"\x89PNG"):
-        return b"IEND" in coded
+        return b"IEND\xaeB`\x82" in coded  # with its checksum
     return not coded.startswith(b"\xff\xd8") or b"\xff\xd9" in coded
