@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import shutil
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from importlib.resources import as_file, files
@@ -57,11 +57,16 @@ class _Scene:
         return self.empty[0]
 
 
-def make_raw(folder: Path, progress: Callable[[str], None]) -> None:
+def make_raw(folder: Path, progress: Callable[[str], None], cameras: Container[str] | None = None) -> None:
     """Write the demo as five cameras would have recorded it, `folder/<camera>.mp4`.
 
-    The videos start one after the other; the third has 29.97 images a second at variable intervals; the fourth camera
+    The videos start at different times; the third has 29.97 images a second at variable intervals; the fourth camera
     stands on its side. Hands clap at the beginning and at the end. The person moves last.
+
+    Args:
+        folder: made if it is missing.
+        progress: is called with a line for each video.
+        cameras: names of those to write; all by default.
     """
     from tk.io.captures.calibration import read_calibration
 
@@ -69,6 +74,8 @@ def make_raw(folder: Path, progress: Callable[[str], None]) -> None:
     with as_file(files("tk") / "data") as data:
         rig = read_calibration(data / "demo" / "calibration.toml").rig
         for c, camera in enumerate(rig):
+            if cameras is not None and camera.name not in cameras:
+                continue
             progress(f"making {folder / camera.name}.mp4")
             parts = (data / "boards", data / "demo" / "background", data / "demo" / "videos")
             scene = _Scene(*(list(_images(part / f"{camera.name}.mp4")) for part in parts))
@@ -156,37 +163,48 @@ def run_raw(folder: Path, force: bool, quiet: bool, no_report: bool) -> None:
     """Make the RAW folder in a folder, and run every command from it to the result.
 
     Raises:
-        CaptureError: the folder exists, and ``force`` is False.
+        CaptureError: the folder exists, and ``force`` is False, or an earlier `tk demo --raw` has not written it.
     """
     from tk.commands.calibrate import calibrate
+    from tk.commands.inspect import inspect
     from tk.commands.sync import sync
     from tk.commands.track import track
 
-    commands: dict[str, click.Command] = {"sync": sync, "calibrate": calibrate, "track": track}
+    run: dict[str, click.Command] = {"sync": sync, "calibrate": calibrate, "inspect": inspect, "track": track}
+    raw, boards, capture, looks = inner = [folder / name for name in ("RAW", "BOARDS", "CAPTURE", "looks")]
+    result, commands = folder / "result.h5", folder / "commands.txt"
     if folder.exists():
         if not force:
             raise CaptureError(f"{folder}: exists; add --force to replace what an earlier tk demo --raw wrote")
-        for inner in ("RAW", "BOARDS", "CAPTURE"):
-            shutil.rmtree(folder / inner, ignore_errors=True)
-    with ConsoleReporter(quiet, stage="making the videos of five cameras") as reporter:
-        make_raw(folder / "RAW", reporter.stage)
-    raw, boards, capture = (folder / name for name in ("RAW", "BOARDS", "CAPTURE"))
-    result = folder / "result.h5"
+        if not commands.is_file():
+            raise CaptureError(f"{folder}: is not of an earlier tk demo --raw; choose a new folder")
+        for old in inner:
+            shutil.rmtree(old, ignore_errors=True)
     lines = [
-        ["sync", raw, "-o", boards, "--from", f"{BOARDS_S:g}", "--to", f"{EMPTY_S - 1:g}", "--by", "sound"],
+        ["sync", raw, "-o", boards, "--from", f"{BOARDS_S:g}", "--to", f"{EMPTY_S - 1:g}"],
         ["calibrate", boards, "--square", f"{SQUARE_M:g}", "-o", raw / "calibration.toml"],
         ["sync", raw, "-o", capture, "--from", f"{PERSON_S:g}", "--to", f"{PERSON_S + 5:g}",
          "--empty", f"{EMPTY_S:g}:{PERSON_S - 0.5:g}"],
-        ["track", capture, "-o", result, "--force", *(["--no-report"] if no_report else [])],
+        ["inspect", capture, "-o", looks],
+        ["track", capture, "-o", result, *(["--force"] if force else []), *(["--no-report"] if no_report else [])],
     ]  # fmt: skip
-    for line in lines:
-        words = [str(word) for word in line]
+    typed = [[str(word) for word in line] for line in lines]
+    folder.mkdir(parents=True, exist_ok=True)
+    commands.write_text("".join(f"tk {shlex.join(words)}\n" for words in typed))
+    with ConsoleReporter(quiet, stage="making the videos of five cameras") as reporter:
+        make_raw(raw, reporter.stage)
+    for words in typed:
         click.echo(f"\n$ tk {shlex.join(words)}")
-        quietly = ["--quiet"] if quiet else []
-        if commands[words[0]].main([*words[1:], *quietly], f"tk {words[0]}", standalone_mode=False):
+        silent = quiet and words[0] != "inspect"  # which shows no progress
+        options = ["--quiet"] if silent else []
+        if run[words[0]].main([*words[1:], *options], f"tk {words[0]}", standalone_mode=False):
             return
     with as_file(files("tk") / "data" / "demo" / "truth.h5") as truth:
         from tk.evaluation.joints import evaluate_files
 
         click.echo(evaluate_files(result, truth).format_table())
-    click.echo(f"Everything is in {folder}. Next: your own videos in one folder, and the same commands.")
+    click.echo(
+        f"Everything is in {folder}, the commands in {commands}. Look at sync.png in {boards.name} and {capture.name}, "
+        f"RAW/calibration.html, looks/inspect.png{'' if no_report else ', result.mp4, result.html'}. "
+        "Next: your own videos in one folder, and the same commands with your times."
+    )

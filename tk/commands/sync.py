@@ -58,7 +58,7 @@ def _part(ctx: click.Context, option: click.Parameter, text: str | None) -> tupl
 @click.option("-o", "--output", type=base.PATH, required=True, metavar="CAPTURE", help="Folder of the capture.")
 @base.names_option("--by", help="Use these methods only: sound, flash, person, timecode.")
 @click.option("--offsets", metavar="A=0,B=1.37", callback=_offsets, help="Offsets by hand, seconds, of all cameras.")
-@click.option("--from", "begin", type=float, metavar="S", help="Begin the capture here: seconds of the first camera.")
+@click.option("--from", "begin", type=float, metavar="S", help="Begin here: seconds of the first camera's video.")
 @click.option("--to", "end", type=float, metavar="S", help="End the capture here.")
 @click.option("--empty", metavar="A:B", callback=_part, help="The scene is empty here, seconds.  [default: found]")
 @click.option("--fps", type=float, metavar="HZ", help="Rate of the capture.  [default: that of the slowest camera]")
@@ -87,6 +87,8 @@ def sync(raw: Path, output: Path, **given: Any) -> None:
         fps = given["fps"]
         if fps is not None and not 0.1 <= fps <= 1000:
             raise ConfigError(f"--fps {fps:g}: must be between 0.1 and 1000")
+        if None not in (given["begin"], given["end"]) and given["begin"] >= given["end"]:
+            raise ConfigError(f"--from {given['begin']:g} --to {given['end']:g}: ends before it begins")
         check_capture(output, raw, given["force"])
         recordings = read_raw(raw, given["cameras"])
         calibration, cameras = read_cameras(raw, recordings)

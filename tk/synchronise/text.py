@@ -21,7 +21,7 @@ def table(done: Synchronised) -> str:
         sigma = float(clocks.offset_sigma_s[c])
         offset = "not sure"
         if np.isfinite(clocks.offsets_s[c]) and c not in decision.unsure:
-            offset = f"{clocks.offsets_s[c]:+.4f} s"
+            offset = f"{_no_minus_zero(clocks.offsets_s[c], 4):+.4f} s"
             if c and np.isfinite(sigma):
                 offset += f" ± {1000 * sigma:.1f} ms"
         rows.append(
@@ -45,7 +45,11 @@ def _drift(done: Synchronised, c: int) -> str:
         return "0"
     if not sigma < KNOWN_RATE:
         return "not determined"
-    return f"{1e6 * (done.clocks.rates[c] - 1):+.0f} ± {1e6 * sigma:.0f} ppm"
+    return f"{_no_minus_zero(1e6 * (done.clocks.rates[c] - 1), 0):+.0f} ± {1e6 * sigma:.0f} ppm"
+
+
+def _no_minus_zero(value: float, digits: int) -> float:
+    return round(float(value), digits) + 0.0
 
 
 def to_dict(done: Synchronised) -> dict[str, Any]:
@@ -84,7 +88,7 @@ def chosen_span(done: Synchronised, begin: float | None, end: float | None) -> t
     chosen = first if begin is None else begin, last if end is None else end
     for option, value in (("--from", begin), ("--to", end)):
         if value is not None and not first - 1e-3 <= value <= last + 1e-3:
-            raise ConfigError(f"{option} {value:g}: all cameras show {first:.2f} s to {last:.2f} s only")
+            raise ConfigError(f"{option} {value:g}: {_shown(done, first, last)}")
     if chosen[0] >= chosen[1]:
         raise ConfigError(f"--from {chosen[0]:g} --to {chosen[1]:g}: ends before it begins")
     return chosen
@@ -100,8 +104,14 @@ def empty_part(done: Synchronised, given: tuple[float, float] | None) -> tuple[f
         return find_empty(done.looks, done.clocks)
     first, last = common_span(done.recordings, done.clocks)
     if given[0] < first - 1e-3 or given[1] > last + 1e-3:
-        raise ConfigError(f"--empty {given[0]:g}:{given[1]:g}: all cameras show {first:.2f} s to {last:.2f} s only")
+        raise ConfigError(f"--empty {given[0]:g}:{given[1]:g}: {_shown(done, first, last)}")
     return given
+
+
+def _shown(done: Synchronised, first: float, last: float) -> str:
+    """Return the remedy for a time outside of the common time."""
+    name = done.recordings[0].name
+    return f"all cameras show {first:.2f} s to {last:.2f} s of {name} only; give seconds of {name}'s video in this part"
 
 
 def without_empty(

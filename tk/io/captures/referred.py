@@ -146,12 +146,13 @@ def open_referred(
             )
     files: dict[str, list[Path]] = {}
     users: dict[Path, str] = {}
+    gone = "does not exist; put the video back, correct the path, or run tk sync again"
     for name, video in videos.items():
         where = f"{folder / 'capture.toml'}: [videos.{name}]"
         files[name] = [folder / path for path in video.paths]
         for path, given in zip(files[name], video.paths, strict=True):
             if not path.is_file():
-                what = "is a folder; name its video, or a list of its chapters" if path.is_dir() else "does not exist"
+                what = "is a folder; name its video, or a list of its chapters" if path.is_dir() else gone
                 raise VideoError(f"{where}: path {given} {what}")
             other = users.setdefault(path.resolve(), name)
             if other != name or files[name].count(path) > 1:
