@@ -114,6 +114,14 @@ def test_video_of_other_instants_is_refused() -> None:
         run(recorded)
 
 
+def test_camera_that_sees_a_smaller_board_is_refused() -> None:
+    """The first poses of its boards agree roughly, so that only the adjustment shows the contradiction."""
+    recorded = footages()
+    recorded[2] = see(RIG[2], POSES, 2, make_board("charuco", None, 0.09))
+    with pytest.raises(CalibrationError, match="camera cam3: contradicts the others"):
+        run(recorded, replace(QUICK, instants=22))
+
+
 @pytest.mark.slow
 def test_camera_that_was_moved_is_named() -> None:
     own = Pose(RIG[1].rotation, RIG[1].translation)

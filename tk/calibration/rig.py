@@ -138,6 +138,7 @@ def calibrate(
     views = [view for view in views if view.instant in state.boards]
     progress("adjusting all cameras and boards")
     solved, kept, dropped = _adjust(state, views)
+    _check_still_connected(names, kept, dropped)
     _check_sides(names, solved.state, kept)
     world = place_world(solved.state, board, options.floor)
     return Calibrated(
@@ -225,6 +226,29 @@ def _adjust(state: State, views: Sequence[View]) -> tuple[Solved, list[View], li
         boards = {i: pose for i, pose in solved.state.boards.items() if i in instants}
         solved = adjust(replace(solved.state, boards=boards), kept, solved.noise_px)
     return solved, kept, dropped
+
+
+def _check_still_connected(names: Sequence[str], kept: Sequence[View], dropped: Sequence[View]) -> None:
+    """Refuse cameras that contradict the others in so many views that the rest do not connect them.
+
+    Raises:
+        CalibrationError: names the smaller group of cameras.
+    """
+    groups = [{c} for c in range(len(names))]
+    for instant in {view.instant for view in kept}:
+        cameras = {view.camera for view in kept if view.instant == instant}
+        joined = set[int]().union(*(group for group in groups if group & cameras))
+        groups = [*(group for group in groups if not group & cameras), joined]
+    apart = sorted(set(range(len(names))) - max(groups, key=len))
+    if apart:
+        views = (*kept, *dropped)
+        others = {view.instant for view in views if view.camera not in apart}
+        count = len({view.instant for view in views if view.camera in apart} & others)
+        which = ", ".join(names[c] for c in apart)
+        raise CalibrationError(
+            f"camera {which}: contradicts the others in all {count} instants that they share: the images "
+            "are of other instants, another board is in view, or the camera was moved"
+        )
 
 
 def _check_sides(names: Sequence[str], state: State, views: Sequence[View]) -> None:

@@ -73,14 +73,12 @@ class _Person:
         patches: one per camera.
         masks, uncertain: (C, H, W) uint8, 0 or 255, and bool.
         landmarks: (C, L, 3) x, y, pixels, and visibility; NaN where there are none.
-        round: round of the search in which the person was found; those of earlier ones were painted over.
     """
 
     patches: list[Patch]
     masks: Images
     uncertain: Bool
     landmarks: NDArray[np.float64]
-    round: int
 
 
 class Segmented(NamedTuple):
@@ -143,11 +141,11 @@ class PeopleMasks:
         left = images.copy()
         people: list[_Person] = []
         sightings: list[list[Sighting]] = [[] for _ in self._rig]
-        for number in range(_ROUNDS):
+        for _ in range(_ROUNDS):
             for c, each in enumerate(sightings):
                 each += self._sightings(left, c)
             located, sightings = locate(self._rig, self._volume, sightings)
-            new = [person for seen in located if (person := self._look(left, seen, number, people))]
+            new = [person for seen in located if (person := self._look(left, seen, people))]
             if not new:
                 break
             people += new
@@ -183,9 +181,9 @@ class PeopleMasks:
         patches = [person.patch(camera, _BALL_MARGIN) for camera in self._rig]
         return [patch or whole for patch, whole in zip(patches, self._whole, strict=True)]
 
-    def _look(self, left: Images, seen: SeenPerson, number: int, people: Sequence[_Person]) -> _Person | None:
+    def _look(self, left: Images, seen: SeenPerson, people: Sequence[_Person]) -> _Person | None:
         """Return the masks of a person in the images that are left; None if they show nobody new."""
-        person = self._empty(self._patches(seen), number)
+        person = self._empty(self._patches(seen))
         for c in seen.cameras:
             self._segment(left, c, person)
         self._agree(left, person)
@@ -235,17 +233,16 @@ class PeopleMasks:
 
     def _separate(self, images: Images, people: Sequence[_Person]) -> None:
         """Add what the segmenter sees of a person where others stood in the square and are now painted over."""
-        first = [person.masks.copy() for person in people]
         for person in people:
             for c in range(len(images)):
                 patch = person.patches[c]
                 beside = [p for p in people if p is not person and patch.holds(np.array([p.patches[c].center]))]
-                if all(other.round < person.round for other in beside):
-                    continue  # nobody is beside the person, or the others were painted over already
+                if not beside:
+                    continue
                 painted = images[c].copy()
-                for other, masks in zip(people, first, strict=True):
+                for other in people:
                     if other is not person:
-                        self._paint(painted, c, masks[c], other.patches[c])
+                        self._paint(painted, c, other.masks[c], other.patches[c])
                 found, landmarks = self._seen(painted, c, person.patches[c])
                 if not self._take(person, c, landmarks):
                     continue
@@ -260,10 +257,10 @@ class PeopleMasks:
         picture, person = self._shown(image, c), self._shown(grown, c) > 0
         picture[person] = cv2.mean(picture, (~person).view(np.uint8))[:3]
 
-    def _empty(self, patches: Sequence[Patch], number: int = 0) -> _Person:
+    def _empty(self, patches: Sequence[Patch]) -> _Person:
         shape = len(self._rig), *self._rig.frame_shape
         landmarks = np.full((len(self._rig), len(LANDMARKS), 3), np.nan)
-        return _Person(list(patches), np.zeros(shape, np.uint8), np.zeros(shape, np.bool_), landmarks, number)
+        return _Person(list(patches), np.zeros(shape, np.uint8), np.zeros(shape, np.bool_), landmarks)
 
     def _ask_again(self, images: Images, c: int, person: _Person, patch: Patch) -> None:
         """Give the segmenter another square of a person in an image."""
