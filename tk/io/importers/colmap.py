@@ -48,8 +48,8 @@ def _read(files: Sequence[Path]) -> Tables:
     folder = files[0].parent
     if not (folder / "cameras.txt").exists():
         raise CalibrationError(
-            f"{folder / 'cameras.bin'}: a binary model; write it as text: colmap model_converter --input_path {folder} "
-            f"--output_path {folder} --output_type TXT"
+            f"{folder / 'cameras.bin'}: a binary model; write it as text",
+            hint=f"colmap model_converter --input_path {folder} --output_path {folder} --output_type TXT",
         )
     lenses = _lenses(folder / "cameras.txt")
     found = Tables(folder / "images.txt", unit=None)
