@@ -413,8 +413,8 @@ def test_binary_colmap_model_names_the_command_that_converts_it(folder: Path) ->
     (folder / "images.bin").write_bytes(b"\0" * 64)
     clips(folder)
     with refused(CalibrationError, "binary model") as caught:
-    assert caught.value.hint.startswith("colmap model_converter")
         read_project(folder)
+    assert caught.value.hint.startswith("colmap model_converter")
 
 
 @pytest.mark.parametrize("transposed", [False, True])
