@@ -61,7 +61,7 @@ def test_cameras_with_fewer_than_two_others_have_no_evidence() -> None:
 
 def test_ratio_falls_with_the_distance_and_is_bounded() -> None:
     visible = np.full(21, 0.95)
-    ratios = [log_ratio(np.full((21, 2), [metres, 0.0]), visible) for metres in (0.0, 0.03, 0.1, 0.5, 5.0)]
+    ratios = [log_ratio(np.full((21, 2), [metres, 0.0]), visible).sum() for metres in (0.0, 0.03, 0.1, 0.5, 5.0)]
     assert ratios == sorted(ratios, reverse=True) and ratios[1] > 0 > ratios[3]
     assert ratios[3] - ratios[4] < 0.1 and np.isfinite(ratios[4])
 
@@ -176,5 +176,7 @@ def test_wrong_landmarks_of_another_image_are_not_held_against_a_camera() -> Non
 
 def test_unknown_place_says_nothing() -> None:
     away, visible = np.full((21, 2), 0.3), np.full(21, 0.95)
-    known, unknown = (log_ratio(away, visible, np.tile(spread * np.eye(2), (21, 1, 1))) for spread in (1e-6, 100.0))
+    known, unknown = (
+        log_ratio(away, visible, np.tile(spread * np.eye(2), (21, 1, 1))).sum() for spread in (1e-6, 100.0)
+    )
     assert known < -10 and abs(unknown) < 1.0

@@ -192,24 +192,24 @@ def right_share(visibility: Float) -> Float:
     return np.asarray(RIGHT_HIDDEN + (RIGHT_SEEN - RIGHT_HIDDEN) * visibility)
 
 
-def log_ratio(away_m: Float, visibility: Float, spread: Float | None = None, known: Float | None = None) -> float:
-    """Return the logarithm of the likelihood of landmarks (N,) that are right, against that of wrong ones, nats.
+def log_ratio(away_m: Float, visibility: Float, spread: Float | None = None, known: Float | None = None) -> Float:
+    """Return (...) the logarithm of the likelihood of each landmark being right, against being wrong, nats.
 
     Args:
-        away_m: (N, 2) metres from where they should be, across the view.
-        visibility: (N,).
-        spread: (N, 2, 2) covariance of where they should be; None: it is known. What is open to a right landmark is
+        away_m: (..., 2) metres from where it should be, across the view.
+        visibility: (...).
+        spread: (..., 2, 2) covariance of where it should be; None: it is known. What is open to a right landmark is
             open to a wrong one, too, so an unknown place gives a ratio near 0.
-        known: (N,) probability that this place is right; None: 1.
+        known: (...) probability that this place is right; None: 1.
     """
     right = right_share(visibility) * (1.0 if known is None else known)
-    covariance = deviation(visibility)[:, None, None] ** 2 * np.eye(2) + (0.0 if spread is None else spread)
-    finite = np.asarray(np.isfinite(away_m).all(axis=1))
-    away = np.where(finite[:, None], away_m, 0.0)
-    square = np.where(finite, (away * np.linalg.solve(covariance, away[..., None])[..., 0]).sum(axis=1), np.inf)
+    covariance = deviation(visibility)[..., None, None] ** 2 * np.eye(2) + (0.0 if spread is None else spread)
+    finite = np.asarray(np.isfinite(away_m).all(axis=-1))
+    away = np.where(finite[..., None], away_m, 0.0)
+    square = np.where(finite, (away * np.linalg.solve(covariance, away[..., None])[..., 0]).sum(axis=-1), np.inf)
     wide = covariance + np.eye(2) / (2 * np.pi * WRONG_DENSITY)
     ratio = np.sqrt(np.linalg.det(wide) / np.linalg.det(covariance)) * np.exp(-0.5 * square)
-    return float(INDEPENDENT * np.log(right * ratio + 1.0 - right).sum())
+    return np.asarray(INDEPENDENT * np.log(right * ratio + 1.0 - right))
 
 
 def _normalised(rig: Rig, landmarks: Float) -> Float:
