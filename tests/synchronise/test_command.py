@@ -109,6 +109,18 @@ def test_second_run_does_not_replace_a_capture(copy: Path) -> None:
     assert document["subject"]["height"] == 1.7 and document["from"] == 3.0
 
 
+def test_another_calibration_in_the_capture_is_replaced_only_if_asked_for(copy: Path) -> None:
+    offsets = ("--offsets", "a=0,b=2.2,c=1")
+    calibrate(copy)
+    capture = copy.parent / "CAPTURE"
+    capture.mkdir()
+    (capture / "calibration.toml").write_text("# of another day\n")
+    result, _ = run(copy, *offsets)
+    assert result.exit_code == 2 and "differs from" in result.output and not (capture / "capture.toml").exists()
+    assert run(copy, *offsets, "--force")[0].exit_code == 0
+    assert (capture / "calibration.toml").read_bytes() == (copy / "calibration.toml").read_bytes()
+
+
 def test_chapters_are_one_video(copy: Path) -> None:
     (copy / "b.mp4").unlink()
     (copy / "b").mkdir()

@@ -11,7 +11,8 @@ one person if a square shows several, and misses people whom others hide. The ca
    gets the square around the hull.
 3. The people who are found are painted over, and the search is repeated until nobody new is found. Detections that
    match no other camera's are people whom one camera shows. Where a person's landmarks in a camera show somebody else
-   than in most cameras, the segmenter gets the square around the points that these cameras show.
+   than in most cameras, the segmenter gets the square around the points that these cameras show. A further answer of
+   the segmenter counts only if the cameras agree no less on the person's landmarks.
 4. Where somebody else stands in a person's square, the segmenter gets the square again, with everybody else painted
    over.
 
@@ -270,7 +271,7 @@ class PeopleMasks:
             self._put(person, c, found)
 
     def _take(self, person: _Person, c: int, landmarks: NDArray[np.float64]) -> bool:
-        """Replace a person's landmarks in an image, unless fewer cameras then agree on them: the network shows somebody
+        """Replace a person's landmarks in an image, unless the cameras then agree less: the network shows somebody
         else. Return whether they were replaced."""
         before, earlier = consensus(self._rig, person.landmarks).support, person.landmarks[c].copy()
         person.landmarks[c] = landmarks

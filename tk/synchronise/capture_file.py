@@ -57,6 +57,9 @@ def check_capture(folder: Path, raw: Path, force: bool) -> None:
     file = folder / "capture.toml"
     if file.exists() and not force:
         raise CaptureError(f"{file}: exists; choose another folder", hint="or replace its [videos] with --force")
+    own, given = folder / "calibration.toml", raw / "calibration.toml"
+    if own.exists() and given.exists() and own.read_bytes() != given.read_bytes() and not force:
+        raise CaptureError(f"{own}: differs from {given}; delete the wrong one", hint="or replace it with --force")
 
 
 def write_capture(
@@ -68,8 +71,7 @@ def write_capture(
     empty: tuple[float, float] | None,
     calibration: Calibration | None,
 ) -> None:
-    """Write `capture.toml`, and a copy of the calibration where the capture has none. Other keys of an existing
-    `capture.toml` stay.
+    """Write `capture.toml`, and a copy of the calibration. Other keys of an existing `capture.toml` stay.
 
     Args:
         folder: the capture; made if it does not exist.
@@ -108,7 +110,7 @@ def write_capture(
     with replacing(file, CaptureError) as part:
         part.write_text(tomli_w.dumps(document), encoding="utf-8")
     target = folder / "calibration.toml"
-    if calibration is not None and not target.exists():
+    if calibration is not None:
         with replacing(target, CaptureError) as part:
             part.write_bytes(calibration.path.read_bytes())
 

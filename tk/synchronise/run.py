@@ -25,7 +25,8 @@ Float = NDArray[np.float64]
 #: methods that find offsets; the user can choose
 METHODS = ("sound", "flash", "person", "timecode")
 #: a camera's lag is certain if the mean significance over its pairs is above this, and above that of its second best
-#: lag by this factor; without and with known cameras
+#: lag by this factor; without and with known cameras. Chosen on raw folders made of two rendered recordings; the share
+#: of false lags above them has not been measured.
 _SURE, _SECOND = {"person": 5.0, "cameras": 6.0}, {"person": 1.35, "cameras": 1.25}
 #: a mirrored image fits better than the image by this factor
 _MIRRORED = 1.5
@@ -41,6 +42,7 @@ class Synchronised:
         recordings: the cameras; the first is the reference.
         decision: clocks, methods, notes.
         looks: small images of each camera.
+        mirrored: cameras whose images are mirrored.
     """
 
     recordings: list[Recording]

@@ -20,7 +20,7 @@ import pytest
 from tests.io.result_files import append, assert_complete, fail_after, resume, write
 from tests.io.result_victim import META
 from tk.errors import ResultError, TkError
-from tk.io.results.reader import read_joints, read_result
+from tk.io.results.reader import read_joints, read_result, read_truth
 from tk.io.results.writer import ResultWriter
 
 ROOT = Path(__file__).parents[3]
@@ -81,12 +81,13 @@ def test_unusable_files_are_named(tmp_path: Path, make, message: str, read) -> N
     assert "\n" not in str(caught.value)
 
 
-def test_results_of_an_older_version_are_refused_but_give_their_joints(tmp_path: Path) -> None:
+def test_results_of_an_older_version_are_ground_truth_and_no_results(tmp_path: Path) -> None:
     path = tmp_path / "some.h5"
     of_version(2)(path)
-    with pytest.raises(ResultError, match=r"format_version is 2.*version 3: track the capture again"):
-        read_result(path)
-    assert np.isfinite(read_joints(path).positions).all()
+    for read in (read_result, read_joints):
+        with pytest.raises(ResultError, match=r"format_version is 2.*version 3: track the capture again"):
+            read(path)
+    assert np.isfinite(read_truth(path)[0].positions).all()
 
 
 @pytest.mark.parametrize(
