@@ -39,6 +39,7 @@ DEVELOPMENT = {
     "dev4": _rig(_RING4, ["action", "phone"], 1),
     "dev5": _rig(_RING5, ["action wide", "webcam", "action"], 2),
     "dev8": _rig(_RING8, ["phone", "action wide"], 3),
+    "dev4 rational": _rig(_RING4, ["rational"], 4),
 }
 REPORT = {
     "report4": _rig(_RING4, ["action", "action", "webcam", "action wide"], 11),

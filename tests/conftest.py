@@ -10,6 +10,7 @@ import os
 import re
 import shutil
 import signal
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -152,6 +153,15 @@ def tk(capfd: pytest.CaptureFixture[str]) -> Tk:
     return run
 
 
+def run_clock(monkeypatch: pytest.MonkeyPatch, speed: float) -> None:
+    """Let the clock of this process run faster or slower. A run writes its rows every half second of it."""
+    clock = time.perf_counter
+    monkeypatch.setattr(time, "perf_counter", lambda: speed * clock())
+
+
+EVERY_FRAME = 1e6  # speed of the clock with which a run writes every frame at once
+
+
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
     """Return a path written by ``make``, in the first worker of this test run that needs it."""
     root = factory.getbasetemp()
@@ -192,6 +202,17 @@ def tracked(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         track(open_capture(tiny), path, settings_file.from_toml(QUICK), method="volumetric", store_hull=True)
 
     return made_once(tmp_path_factory, "unbroken.h5", make)
+
+
+@pytest.fixture(scope="session")
+def causal(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The result, read-only, of an uninterrupted first pass of the default method over the rendered capture."""
+    from tk.io.captures.capture import open_capture
+
+    def make(path: Path) -> None:
+        assert track(open_capture(tiny), path, settings_file.from_toml(QUICK), causal=True).lost == 0
+
+    return made_once(tmp_path_factory, "causal.h5", make)
 
 
 @pytest.fixture(scope="session")

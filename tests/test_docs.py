@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -95,14 +96,14 @@ def test_commands_are_accepted(page: Path) -> None:
 
 @pytest.mark.filterwarnings("default")
 def test_commands_that_need_no_recording_run(
-    tk: Tk, tiny: Path, quick: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tk: Tk, causal: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All that work on nothing, or on the demo's result; `tk demo` itself has a test of its own."""
     lines = {line: page for page in PAGES for line in shell_commands(page)}
     own = [line for line in lines if re.match(r"tk (--help|\w+ --help|config)|tk \w+ demo\.h5", line)]
     assert len(own) >= 5 and any("export demo.h5" in line for line in own)
     monkeypatch.chdir(tmp_path)
-    assert tk("track", tiny, "-o", "demo.h5", "--config", quick, "--frames", ":2", "--causal").code == 0
+    shutil.copy(causal, "demo.h5")
     (tmp_path / "settings.toml").write_text("voxels = 64\n")
     for line in own:
         words = shlex.split(line, comments=True)

@@ -20,6 +20,7 @@ from tk.commands.moved import level, refine
 from tk.commands.reconstruct import reconstruct
 from tk.commands.render import render
 from tk.commands.report import report
+from tk.commands.sync import sync
 from tk.commands.track import track
 from tk.commands.view import view
 
@@ -32,6 +33,6 @@ def main() -> None:
 
 for _command in (
     batch, calibrate, config, demo, doctor, evaluate, export, import_, inspect, level, masks, reconstruct, refine,
-    render, report, track, view,
+    render, report, sync, track, view,
 ):  # fmt: skip
     main.add_command(_command)

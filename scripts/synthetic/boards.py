@@ -32,6 +32,7 @@ LENSES: dict[str, tuple[float, tuple[float, ...], bool]] = {
     "phone": (0.80, (0.06, -0.12, 0.0008, -0.0005, 0.04), False),
     "webcam": (0.85, (-0.09, 0.05, -0.0006, 0.0010, 0.0), False),
     "action": (0.62, (-0.24, 0.075, 0.0004, -0.0007, -0.012), False),
+    "rational": (0.40, (0.6, 0.05, 0.0004, -0.0006, 0.0, 0.85, 0.2, 0.01), False),
     "action wide": (0.50, (0.035, 0.012, -0.012, 0.003), True),
 }
 
@@ -138,13 +139,16 @@ def texture(board: Board) -> NDArray[np.float32]:
 class BoardCamera:
     """Renders one camera's images of a board."""
 
-    def __init__(self, camera: Camera, board: Board, sensor: Sensor, room: bool = True) -> None:
+    def __init__(self, camera: Camera, board: Board, sensor: Sensor, room: Float | bool = True) -> None:
+        """``room``: whether the generated room is behind the board; or a picture of one (H, W, 3), linear RGB."""
         self.camera, self.board, self.sensor = camera, board, sensor
         self._texture = texture(board)
         y, x = np.mgrid[: camera.height, : camera.width]
         grid = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
         self._rays = camera.rays(grid).reshape(camera.height, camera.width, 3)
-        if room:
+        if isinstance(room, np.ndarray):
+            self._background = room.astype(np.float32)
+        elif room:
             lamps = make_lamps(np.array([-1.5, -1.5, 0.0]), np.array([1.5, 1.5, 2.2]))
             view = view_room(camera, lamps, 2)
             self._background = (view.indirect + view.direct.sum(axis=0)).astype(np.float32)

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.calibration.rigs import BOARD, POSES, RIG, visible
+from scripts.synthetic.boards import make_rig, place_boards
+from tests.calibration.rigs import BOARD, POSES, RECIPE, RIG, see, visible
 from tk.calibration.bundle import Lens, Solved, State, View, adjust, linearise
+from tk.calibration.intrinsics import fit_lens
 from tk.calibration.lens import FISHEYE, PINHOLE5, PINHOLE8, Model, project, undistort
 from tk.calibration.poses import Pose, angle_deg, exp
 
@@ -114,3 +116,15 @@ def test_held_intrinsics_do_not_move() -> None:
     start = replace(start, lenses=(replace(start.lenses[0], held=held), *start.lenses[1:]))
     solved = adjust(start, views)
     np.testing.assert_allclose(solved.state.lenses[0].values, start.lenses[0].values, rtol=1e-9)
+
+
+def test_held_out_views_choose_the_rational_model_where_it_is_right() -> None:
+    recipe = replace(RECIPE, cameras=((30, 3.2, 1.4, "rational"), (85, 3.4, 2.0, "webcam")), shared=2, close=6)
+    rig = make_rig(recipe)
+    footage = see(rig[0], place_boards(recipe, rig, BOARD), 0, noise_px=0.1)
+    views = [View(0, i, BOARD.points[s.detection.ids], s.detection.pixels, s.detection.ids) for i, s in
+             footage.seen.items()]  # fmt: skip
+    found = fit_lens(views, recipe.size, [PINHOLE5, PINHOLE8], None)
+    assert found.lens.model is PINHOLE8
+    assert found.held_out_px["pinhole8"] < 0.8 * found.held_out_px["pinhole5"]
+    np.testing.assert_allclose(found.lens.values[:2], rig[0].matrix[[0, 1], [0, 1]], rtol=3e-3)

@@ -114,6 +114,14 @@ def test_video_of_other_instants_is_refused() -> None:
         run(recorded)
 
 
+def test_camera_that_sees_a_smaller_board_is_refused() -> None:
+    """The first poses of its boards agree roughly, so that only the adjustment shows the contradiction."""
+    recorded = footages()
+    recorded[2] = see(RIG[2], POSES, 2, make_board("charuco", None, 0.09))
+    with pytest.raises(CalibrationError, match="camera cam3: contradicts the others"):
+        run(recorded, replace(QUICK, instants=22))
+
+
 @pytest.mark.slow
 def test_camera_that_was_moved_is_named() -> None:
     own = Pose(RIG[1].rotation, RIG[1].translation)
@@ -124,6 +132,16 @@ def test_camera_that_was_moved_is_named() -> None:
     assert verdict.word != "good"
     blamed = [text for _, text in verdict.reasons if "contradict" in text]
     assert blamed and all(text.startswith("camera cam2") for text in blamed), verdict.reasons
+
+
+def test_two_cameras_that_agree_show_which_one_is_wrong(good: tuple[Calibrated, Verdict]) -> None:
+    done, _ = good
+    all_three = {i for i in done.world.state.boards if sum(view.instant == i for view in done.views) == 3}
+    wrong = max(range(3), key=lambda c: sum(view.camera == c for view in done.views))  # others are rarer, not wrong
+    dropped = tuple(view for view in done.views if view.camera == wrong and view.instant in all_three)
+    kept = tuple(view for view in done.views if all(view is not other for other in dropped))
+    verdict = judge(replace(done, views=kept, dropped=dropped))
+    assert [one.contradicting for one in verdict.cameras] == [len(dropped) if c == wrong else 0 for c in range(3)]
 
 
 def test_mirrored_camera_is_refused() -> None:
@@ -156,6 +174,17 @@ def test_without_a_board_on_the_floor_the_cameras_give_up(good: tuple[Calibrated
     assert world.floor is None and "no board lies on the floor" in world.how
     up = world.state.cameras[0].rotation @ np.array([0.0, 0, 1])
     assert np.degrees(np.arccos(up @ RIG[0].rotation @ np.array([0.0, 0, 1]))) < 3
+
+
+def test_copied_images_are_refused() -> None:
+    """Encoding again moves the points by some tenths of a pixel."""
+    first, second, _ = footages()
+    copied = see(RIG[0], {i: pose for i, pose in POSES.items() if i < 100}, 0, noise_px=0.3)
+    copied = replace(copied, name="cam3", path=second.path.with_name("cam3"))
+    with pytest.raises(
+        CalibrationError, match=r"camera cam3: has the same images as camera cam1: .* was a file copied"
+    ):
+        run([first, second, copied])
 
 
 def test_one_camera_has_intrinsics_only() -> None:

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.conftest import Tk, track
+from tests.conftest import QUICK, Tk, track
 from tests.model.figures import draw_silhouettes
 from tk.evaluation.views import capture_of, evaluate_views
 from tk.io import settings_file
@@ -21,18 +21,12 @@ from tk.model.body.joints import ROWS
 from tk.model.body.skeleton import JOINTS, Skeleton, skeleton_of_names
 from tk.trackers.bodies import body_and_poses
 
-SETTINGS = """
-ahead = 0
-[silhouette]
-init_frames = 2
-"""
-
 
 @pytest.fixture(scope="module")
 def three_views(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("views") / "r.h5"
     capture = open_capture(tiny, open_capture(tiny).rig.names[:3])
-    track(capture, path, settings_file.from_toml(SETTINGS), method="silhouette", frames=(0, 3))
+    track(capture, path, settings_file.from_toml(QUICK), method="silhouette", frames=(0, 3))
     return path
 
 

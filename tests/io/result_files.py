@@ -5,13 +5,13 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 
 from tests.io.result_victim import META, make_frame, make_state
-from tk.io import hdf5_writer
 from tk.io.results.data import ResultMeta, UsedCameras, Value
 from tk.io.results.reader import read_result
 from tk.io.results.schema import checked_row, columns_of
@@ -111,13 +111,13 @@ def write_truth(path: Path, frames: list[int], names: tuple[str, ...] = JOINTS, 
 
 def fail_after(writes: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the disk be full after this number of writes."""
-    left, original = [writes], hdf5_writer._write
+    left = [writes]
 
-    def write(file: io.FileIO | io.BytesIO, place: int, data: bytes) -> None:
-        if isinstance(file, io.FileIO):
+    class File(io.FileIO):
+        def write(self, data: Any) -> int:
             left[0] -= 1
             if left[0] < 0:
                 raise OSError(28, "No space left on device")
-        original(file, place, data)
+            return super().write(data)
 
-    monkeypatch.setattr(hdf5_writer, "_write", write)
+    monkeypatch.setattr(io, "FileIO", File)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -10,11 +11,10 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.conftest import QUICK, Tk, track
+from tests.conftest import Tk
 from tests.made_results import write_motion
 from tests.model.figures import draw_silhouettes
 from tk.errors import ResultError
-from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.data import UsedCameras
 from tk.io.results.reader import read_joints, read_result
@@ -98,9 +98,8 @@ def test_outlines_of_cones_are_their_silhouette() -> None:
     assert outside.sum() < 0.01 * (drawn > 0).sum()
 
 
-def test_results_of_the_region_tracker_are_drawn(tiny: Path, tmp_path: Path) -> None:
-    path = tmp_path / "region.h5"
-    track(open_capture(tiny), path, settings_file.from_toml(QUICK), frames=(0, 2))
+def test_results_of_the_region_tracker_are_drawn(tiny: Path, causal: Path, tmp_path: Path) -> None:
+    path = Path(shutil.copy(causal, tmp_path / "region.h5"))
     capture = open_capture(tiny, masks="none")
     (sheet,) = write_sheets(Overlay(capture, read_result(path)), tmp_path, [1], full=True)
     picture = cv2.imread(str(sheet))

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+import av
 import numpy as np
 import pytest
 
@@ -14,7 +18,7 @@ from tk.io.results.reader import read_result
 from tk.model.body.joints import SEGMENTS
 from tk.render.palette import SEGMENT_COLORS
 from tk.render.scene import HEIGHT, WIDTH, Scene
-from tk.render.video import _Encoder, made_here, video_writer
+from tk.render.video import made_here, video_writer
 
 
 def moving(count: int) -> list[np.ndarray]:
@@ -26,8 +30,6 @@ def moving(count: int) -> list[np.ndarray]:
 
 
 def decoded(path: Path) -> list[np.ndarray]:
-    import av
-
     with av.open(str(path)) as container:
         (stream,) = container.streams
         assert stream.codec_context.name == "h264" and stream.codec_context.pix_fmt == "yuv420p"
@@ -65,12 +67,16 @@ def test_error_keeps_the_earlier_video(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("when", ["at once", "at the end"])
 def test_full_disk_ends_the_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
-    def fail(encoder: _Encoder) -> None:
-        while when == "at the end" and encoder._next() is not None:
-            pass
+    original = av.open
+
+    @contextmanager
+    def full(*given: Any, **options: Any) -> Iterator[Any]:
+        if when == "at the end":
+            with original(*given, **options) as container:
+                yield container
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(_Encoder, "_encode", fail)
+    monkeypatch.setattr(av, "open", full)
     with pytest.raises(DiskFullError, match="No space left"), video_writer(tmp_path / "video.mp4", 15) as add:
         for picture in moving(20):
             add(picture)

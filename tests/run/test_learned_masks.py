@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from tests.people import truth, write_people
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.captures.frames import FrameSet
+from tk.model.cameras.camera import Rig
 from tk.run.learned_masks import LEARNED, LEARNED_AND_SEGMENTER, SEGMENTER
 from tk.run.segmentation import Labels, make_labeller
 from tk.run.task import Task
@@ -70,7 +70,7 @@ def test_few_frames_are_asked_for_and_all_masks_show_the_person(folder: Path) ->
     assert max(wrong(labels.masks, truth(folder, k)) for k, labels in enumerate(found)) < 0.1
 
 
-def test_a_note_says_why_the_segmenter_makes_all_masks(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_note_says_why_the_segmenter_makes_all_masks(folder: Path) -> None:
     capture, _ = capture_of(folder)
     said: list[str] = []
     short = replace(capture, frame_count=40)
@@ -79,8 +79,8 @@ def test_a_note_says_why_the_segmenter_makes_all_masks(folder: Path, monkeypatch
     said.clear()
     make_labeller(Task.of(capture, Settings()), said.append)
     assert not said
-    monkeypatch.setattr("tk.run.learned_masks._SAMPLE_BYTES", 7 * 5 * math.prod(capture.setup().rig.frame_shape) * 4)
-    make_labeller(Task.of(capture, Settings()), said.append)
+    large = Rig(tuple(replace(camera, width=5000, height=4000) for camera in capture.rig))
+    make_labeller(Task.of(replace(capture, rig=large), Settings()), said.append)
     assert "images are too large" in said[-1]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import gc
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,19 +15,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import h5py
 import numpy as np
 import pytest
 
 from tests import conftest
-from tests.conftest import FRAMES, QUICK, Silent
+from tests.conftest import EVERY_FRAME, FRAMES, QUICK, Silent, run_clock
 from tests.people import write_people
 from tests.run.test_session import assert_same, send
 from tk.errors import ConfigError, VideoError, WorkerError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.reader import read_result
-from tk.run import loop, prefetch, worker
+from tk.run import prefetch, worker
 from tk.run.prefetch import Ahead, Observations, Serial, open_observations
 from tk.run.task import Task
 from tk.settings import Settings
@@ -81,17 +83,23 @@ def test_frames_are_made_here_if_no_memory_can_be_shared(tiny: Path, monkeypatch
     ]
 
 
-@pytest.mark.parametrize("spare", [2, 40])
-def test_held_frames_are_not_overwritten(tiny: Path, monkeypatch: pytest.MonkeyPatch, spare: int) -> None:
+def test_held_frames_are_not_overwritten(tiny: Path, tmp_path: Path) -> None:
     """More of them than the ring has slots, some dropped in between, and views after their frame."""
-    monkeypatch.setattr(prefetch, "_SPARE", spare)
-    capture = open_capture(tiny)
+    capture, times = open_capture(tiny), 5
     expected = arrays(Serial(Task.of(capture, AHEAD), nobody), 0, FRAMES)
-    with Ahead(Task.of(capture, AHEAD), nobody) as source:
-        held = {o.index: o.masks[1:, ::2] for o, _ in source.frames(0, FRAMES) if o.index % 4 != 2}
-    assert len(held) > FRAMES // 2
+    for name in ("calibration.toml", "capture.toml"):
+        shutil.copy(tiny / name, tmp_path)
+    for c, camera in enumerate(capture.rig):
+        for kind, layer in (("images", 1), ("masks", 2)):
+            (tmp_path / kind / camera.name).mkdir(parents=True)
+            for k in range(times * FRAMES):
+                image = expected[k % FRAMES][layer][c]
+                cv2.imwrite(str(tmp_path / kind / camera.name / f"{k:06d}.png"), image)
+    with Ahead(Task.of(open_capture(tmp_path), AHEAD), nobody) as source:
+        held = {o.index: o.masks[1:, ::2] for o, _ in source.frames(0, times * FRAMES) if o.index % 4 != 2}
+    assert len(held) > 50
     for index, masks in held.items():
-        np.testing.assert_array_equal(masks, expected[index][2][1:, ::2])
+        np.testing.assert_array_equal(masks, expected[index % FRAMES][2][1:, ::2])
 
 
 def test_prefetching_does_not_change_the_result(tiny: Path, tracked: Path, tmp_path: Path) -> None:
@@ -139,7 +147,7 @@ def test_a_defect_keeps_its_traceback(tiny: Path) -> None:
 
 
 def test_a_killed_process_is_reported_in_one_line(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loop, "WRITE_EVERY_S", 0)
+    run_clock(monkeypatch, EVERY_FRAME)
 
     class Killer(Silent):
         def advance(self, frame: int, estimate: object) -> None:

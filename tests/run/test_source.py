@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 import tk
-from tests.conftest import QUICK, Silent, refused
+from tests.conftest import EVERY_FRAME, QUICK, Silent, refused, run_clock
 from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, STATURE, walk
@@ -26,12 +26,12 @@ from tk.io.results.reader import read_result
 from tk.io.results.status import Status
 from tk.model.cameras.volume import Volume
 from tk.model.setup import Setup, Subject
-from tk.run import loop, offline
+from tk.run import offline
 from tk.run.member import Member
-from tk.run.people import People
 from tk.run.session import estimates, track_task
 from tk.run.task import Choice, Task, TrackOptions
 from tk.trackers.protocol import Frame
+from tk.trackers.region import RegionTracker
 
 SETTINGS = settings_file.from_toml(QUICK)
 RIG = ring_of_cameras(3, width=160, height=200)
@@ -123,43 +123,51 @@ EMPTY = 3
 LATE = Rendered(np.concatenate([0 * ONE.masks[:EMPTY], ONE.masks]))
 
 
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    """A run that begins with the first frame with somebody."""
+    path = tmp_path_factory.mktemp("begun") / "r.h5"
+    any_pose = replace(SETUP, subjects=(replace(SETUP.subjects[0], in_init_pose=False),))
+    track_task(task(any_pose, LATE, frames=(EMPTY, None)), path, Silent())
+    return read_result(path)
+
+
 @pytest.mark.parametrize("people", ["auto", "all", (0,)])
 def test_frames_before_the_first_person_are_absent_and_the_others_as_if_tracking_began_there(
-    tmp_path: Path, people: Choice
+    begun: Result, tmp_path: Path, people: Choice
 ) -> None:
-    reporter, late, begun = Silent(), tmp_path / "late.h5", tmp_path / "begun.h5"
-    any_pose = replace(SETUP, subjects=(replace(SETUP.subjects[0], in_init_pose=False),))
+    reporter, late = Silent(), tmp_path / "late.h5"
     summary = track_task(task(SETUP, LATE, people=people), late, reporter)
-    track_task(task(any_pose, LATE, frames=(EMPTY, None), people=people), begun, Silent())
-    result, expected = read_result(late), read_result(begun)
+    result = read_result(late)
     absent = 0 if people == "all" else EMPTY  # of several people, only frames with a person have rows
     assert (result.status == Status.ABSENT).tolist() == absent * [True] + len(POSES) * [False]
     assert summary.present == len(POSES) and reporter.frames == list(range(EMPTY + len(POSES)))
     assert reporter.notes == [f"frame {EMPTY}: the first person has entered"]
     for name in ("pose", "joints", "sigma", "status"):
-        np.testing.assert_array_equal(getattr(result, name)[absent:], getattr(expected, name), err_msg=name)
+        np.testing.assert_array_equal(getattr(result, name)[absent:], getattr(begun, name), err_msg=name)
     assert np.isfinite(result.joints).all()
 
 
 @pytest.mark.parametrize("stop", [EMPTY - 2, EMPTY + 1])
 def test_a_run_that_began_with_an_empty_volume_is_resumed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int
+    begun: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int
 ) -> None:
     class Stop(Silent):
         def advance(self, frame: int, estimate: object) -> None:
             if frame == stop:
                 raise KeyboardInterrupt
 
-    monkeypatch.setattr(loop, "WRITE_EVERY_S", 0)
-    whole, part = tmp_path / "whole.h5", tmp_path / "part.h5"
-    track_task(task(SETUP, LATE), whole, Silent())
+    run_clock(monkeypatch, EVERY_FRAME)
+    part = tmp_path / "part.h5"
     stopped = track_task(task(SETUP, LATE), part, Stop())
     # frames are in the file from the first person on; before, there is none
     assert (stopped.interrupted, stopped.frames) == (True, stop + 1 if stop >= EMPTY else 0)
-    assert part.exists() == (stop >= EMPTY) and len(list(tmp_path.iterdir())) == (3 if part.exists() else 1)
+    assert part.exists() == (stop >= EMPTY) and len(list(tmp_path.iterdir())) == (2 if part.exists() else 0)
     track_task(task(SETUP, LATE), part, Silent(), resume=True)
+    result = read_result(part)
+    assert (result.status[:EMPTY] == Status.ABSENT).all()
     for name in ("pose", "status", "sigma"):
-        np.testing.assert_array_equal(getattr(read_result(part), name), getattr(read_result(whole), name))
+        np.testing.assert_array_equal(getattr(result, name)[EMPTY:], getattr(begun, name))
 
 
 def test_nobody_in_any_frame_is_an_error_that_leaves_no_file(tmp_path: Path) -> None:
@@ -171,15 +179,15 @@ def test_nobody_in_any_frame_is_an_error_that_leaves_no_file(tmp_path: Path) -> 
 
 
 def test_a_start_that_fails_after_somebody_has_entered_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
-    begin, attempts, refused_in = People._begin, [], [EMPTY]
+    start, attempts, refused_in = RegionTracker.start, [], [EMPTY]
 
-    def refuse(people: People, member: Member, frames: Sequence[Frame], *rest: Any) -> None:
+    def refuse(tracker: RegionTracker, frames: Sequence[Frame], subject: Subject) -> None:
         attempts.append(frames[0].index)
         if frames[0].index in refused_in:
             raise CaptureError("half a person")
-        begin(people, member, frames, *rest)
+        start(tracker, frames, subject)
 
-    monkeypatch.setattr(People, "_begin", refuse)
+    monkeypatch.setattr(RegionTracker, "start", refuse)
     slow = replace(SETUP, fps=4.0)  # attempts are half a second apart
     found = list(estimates(task(slow, LATE)))
     assert [e.status for e in found][:6] == EMPTY * ["absent"] + 2 * ["lost"] + ["initialised"]
@@ -242,7 +250,7 @@ def test_a_run_stopped_among_the_frames_and_among_the_second_passes_is_finished(
         track_task(run, tmp_path / "r.h5", reporter, resume=resume)
         return read_result(tmp_path / "r.h5").people
 
-    monkeypatch.setattr(loop, "WRITE_EVERY_S", 0)
+    run_clock(monkeypatch, EVERY_FRAME)
     finish_one = offline._Finisher.finish
     assert len(track(Stop(), resume=False)[0].frames) < COUNT
     with monkeypatch.context() as patch:
@@ -262,14 +270,15 @@ def test_a_bystander_is_no_part_of_the_subject() -> None:
     joints = np.array([e.joints for e in found])
     assert min(far_off(joints, who) for who in (0, 1)) < 0.04
     assert not notes
-    list(estimates(task(PAIR, Rendered(MASKS.max(axis=0)), frames=(0, 1)), notes.append))
-    assert any("2 people are in view" in note for note in notes)
 
 
 def test_the_subject_position_chooses_the_person() -> None:
     for person in (0, 1):
         near = replace(PAIR.subjects[0], position=JOINTS[person][0, 0] + 0.1)
-        (found,) = estimates(task(replace(PAIR, subjects=(near,)), Rendered(MASKS.max(axis=0)), frames=(0, 1)))
+        notes: list[str] = []
+        near_task = task(replace(PAIR, subjects=(near,)), Rendered(MASKS.max(axis=0)), frames=(0, 1))
+        (found,) = estimates(near_task, notes.append)
+        assert any("2 people are in view" in note for note in notes)
         assert far_off(found.joints[None], person) < 0.1
 
 
@@ -314,14 +323,14 @@ def everybody(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, ...]:
 @pytest.fixture(scope="module")
 def second(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, tuple[Subject, ...]]:
     """The person who enters, chosen by number, and the subjects whose trackers were started."""
-    begin, subjects = People._begin, []
+    start, subjects = RegionTracker.start, []
 
-    def watch(people: People, member: Member, *rest: Any) -> None:
-        subjects.append(member.subject)
-        begin(people, member, *rest)
+    def watch(tracker: RegionTracker, frames: Sequence[Frame], subject: Subject) -> None:
+        subjects.append(subject)
+        start(tracker, frames, subject)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(People, "_begin", watch)
+        patch.setattr(RegionTracker, "start", watch)
         (found,) = track_entering(tmp_path_factory.mktemp("entering") / "r.h5", (1,))
     return found, tuple(subjects)
 
@@ -348,17 +357,13 @@ def test_somebody_who_enters_later_can_be_chosen(second: tuple[Result, tuple[Sub
     assert [subject.body for subject in subjects] == [None, BODY]  # the subject is the one who is chosen
 
 
-@pytest.mark.parametrize("people", [(1,), (1, 0)])
+@pytest.mark.parametrize(("people", "stop"), [((1,), 14), ((1, 0), 3)])
 def test_a_run_with_somebody_who_enters_later_is_resumed(
-    second: tuple[Result, Any], everybody: tuple[Result, ...], tmp_path: Path, people: Choice
+    second: tuple[Result, Any], everybody: tuple[Result, ...], tmp_path: Path, people: Choice, stop: int
 ) -> None:
+    """Stopped before, and after the person enters."""
     path = tmp_path / "part.h5"
-    if len(people) == 1:
-        with refused(CaptureError, "person 1 did not enter"):
-            track_entering(path, people, 3)
-    else:
-        track_entering(path, people, 3)
-    track_entering(path, people, 14, resume=len(people) > 1)  # 3 is before, 14 after the person enters
+    track_entering(path, people, stop)
     whole = second[:1] if len(people) == 1 else everybody  # in the order in which they came
     for one, other in zip(track_entering(path, people, resume=True), whole, strict=True):
         np.testing.assert_array_equal(one.frames, other.frames)
@@ -369,14 +374,14 @@ def test_a_run_with_somebody_who_enters_later_is_resumed(
 def test_attempts_to_track_somebody_who_is_refused_are_twice_as_far_apart_each_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    begin, attempts = People._begin, []
+    start, attempts = RegionTracker.start, []
 
-    def refuse_others(people: People, member: Member, frames: Sequence[Frame], *rest: Any) -> None:
+    def refuse_others(tracker: RegionTracker, frames: Sequence[Frame], subject: Subject) -> None:
         attempts.append(frames[0].index)
-        if member.number > 0:
+        if len(attempts) > 1:
             raise CaptureError("half a person")
-        begin(people, member, frames, *rest)
+        start(tracker, frames, subject)
 
-    monkeypatch.setattr(People, "_begin", refuse_others)
+    monkeypatch.setattr(RegionTracker, "start", refuse_others)
     found = track_entering(tmp_path / "r.h5", stop=17)
     assert len(found) == 1 and attempts == [0, 10, 12, 16]  # at 4 Hz, from the eighth frame on

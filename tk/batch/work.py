@@ -96,13 +96,13 @@ def _errors(job: Job, note: Callable[[str], None]) -> tuple[float | None, float 
     people, those of the people who were found."""
     from tk.evaluation.joints import evaluate
     from tk.evaluation.people import evaluate_people
-    from tk.io.results.reader import read_people
+    from tk.io.results.reader import read_people, read_truth
 
     truth = job.capture / "truth.h5"
     if not truth.exists():
         return None, None
     try:
-        people, true = read_people(job.output), read_people(truth)
+        people, true = read_people(job.output), read_truth(truth)
         if len(people) == len(true) == 1:
             found = [evaluate(people[0], true[0])]
         else:
@@ -128,10 +128,10 @@ def _movement_cm(job: Job, truth: Path) -> float:
     """Return how far the limb joints move about the trunk in the tracked frames: the largest root mean square of the
     joints, cm, by the ground truth."""
     from tk.evaluation.joints import trunk_axes
-    from tk.io.results.reader import read_joints
+    from tk.io.results.reader import read_joints, read_truth
     from tk.model.body.joints import JOINTS, LIMB_JOINTS
 
-    track = read_joints(truth)
+    track = read_truth(truth)[0]
     p_world = track.positions[np.isin(track.frames, read_joints(job.output).frames)]
     limbs = p_world[:, [JOINTS.index(name) for name in LIMB_JOINTS]] - p_world[:, None, JOINTS.index("pelvis")]
     in_trunk = np.einsum("fki,fjk->fji", trunk_axes(p_world), limbs)

@@ -18,7 +18,7 @@ from tk.errors import ConfigError
 
 Float = NDArray[np.float64]
 
-#: kinds of boards, each with its usual number of columns and rows
+#: kinds of boards, each with its default number of columns and rows
 KINDS = {"charuco": (7, 5), "chessboard": (10, 7), "circles": (4, 11), "aprilgrid": (6, 6)}
 #: side of a ChArUco marker, as a share of the square's
 _MARKER = 0.75
@@ -165,7 +165,7 @@ def make_board(
 
     Args:
         kind: one of :data:`KINDS`.
-        size: columns and rows, as "7x5"; None: the kind's usual ones.
+        size: columns and rows, as "7x5"; None: the default ones of the kind.
         square_m: side of a square, metres.
         marker: side of a marker as a share of the square's (charuco), or gap as a share of the tag's (aprilgrid).
         dictionary: name of the dictionary of markers, as "4x4_50".

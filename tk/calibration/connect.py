@@ -105,7 +105,7 @@ def _unconnected(names: Sequence[str], fitted: Sequence[Fitted], links: Sequence
         return (
             f"camera {names[a]}: contradicts camera {names[b]}: of {len(link.shared)} shared instants only "
             f"{len(link.agreeing)} agree on where they stand to each other; its images are of other instants (a late "
-            "video, swapped files), or are mirrored; synchronise the videos and look at images of the same number"
+            "video, swapped files), or are mirrored; synchronise the videos (tk sync) and look at its sync.png"
         )
     which = ", ".join(names[c] for c in lonely)
     single = len(lonely) == 1

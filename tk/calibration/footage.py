@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,11 @@ from numpy.typing import NDArray
 from tk.calibration.boards import Board
 from tk.calibration.detection import Detection, detect
 from tk.errors import CalibrationError
+from tk.io.captures.capture_toml import read_settings
+from tk.io.captures.clip import Clip
 from tk.io.captures.clip_folder import list_clips
+from tk.io.captures.clock import clips_on_clock
+from tk.io.captures.frames import Images
 from tk.io.captures.pictures import PICTURE_SUFFIXES, picture_number, read_picture
 from tk.io.captures.video import VIDEO_SUFFIXES, probe_video
 
@@ -56,7 +61,7 @@ class Footage:
     Attributes:
         name, path: the camera, its video or folder of pictures.
         width, height: pixels.
-        video: whether instants are frames of a video; else numbers of pictures.
+        clip: the video whose frames are the instants; None: instants are numbers of pictures.
         instants: searched images, by instant.
         seen: the board, by instant.
         samples: grey images without a board, for the explanation, if there are too few with it.
@@ -67,26 +72,30 @@ class Footage:
     path: Path
     width: int = 0
     height: int = 0
-    video: bool = False
+    clip: Clip | None = None
     instants: list[int] = field(default_factory=list)
     seen: dict[int, Seen] = field(default_factory=dict)
     samples: list[Grey] = field(default_factory=list)
     spacing: int = 1
 
 
-def list_cameras(folder: Path) -> dict[str, Path]:
-    """Return the video or folder of pictures of each camera.
+def list_cameras(folder: Path, note: Callable[[str], None]) -> dict[str, Path | Clip]:
+    """Return the video or folder of pictures of each camera; the frames of a capture with `[videos]`.
 
     Raises:
         CalibrationError: the folder cannot be read, or there is no camera in it.
+        CaptureError: its `[videos]` cannot be read.
     """
     if not folder.is_dir():
         raise CalibrationError(f"{folder}: is not a folder; give the one with a folder or a video of each camera")
+    settings = read_settings(folder / "capture.toml")
+    if settings.videos:
+        return dict(clips_on_clock(folder, settings, note))
     for inner in ("videos", "images"):  # as a capture has them
         if (folder / inner).is_dir() and not any((folder / inner / name).is_dir() for name in ("videos", "images")):
             clips = list_clips(folder / inner)
             if clips:
-                return clips
+                return dict(clips)
     clips = {name: path for name, path in list_clips(folder).items() if not path.is_dir() or _holds_images(path)}
     if not clips:
         raise CalibrationError(f"{folder}: holds no cameras; it needs a folder of pictures or a video for each camera")
@@ -108,22 +117,28 @@ def _inside(path: Path) -> Path:
 
 
 def read_footage(
-    folder: Path, board: Board, cameras: Sequence[str] | None, progress: Callable[[str], None]
+    folder: Path,
+    board: Board,
+    cameras: Sequence[str] | None,
+    progress: Callable[[str], None],
+    note: Callable[[str], None] = lambda _: None,
 ) -> list[Footage]:
-    """Find the board in the images of all cameras.
+    """Find the board in the images of all cameras. ``note`` receives lines for the user.
 
     Raises:
         CalibrationError, VideoError: a camera's images cannot be read, or a name is unknown.
     """
-    paths = list_cameras(folder)
+    known = list_cameras(folder, note)
     for name in cameras or ():
-        if name not in paths:
-            raise CalibrationError(f"{folder}: has no camera {name!r}; it has {', '.join(paths)}")
+        if name not in known:
+            raise CalibrationError(f"{folder}: has no camera {name!r}; it has {', '.join(known)}")
     found = []
-    for name, path in paths.items():
+    for name, given in known.items():
         if cameras is None or name in cameras:
+            path = given if isinstance(given, Path) else given.path
             progress(f"searching for the board in {path}")
-            footage = Footage(name, path, video=not path.is_dir())
+            clip = given if isinstance(given, Clip) else None if path.is_dir() else probe_video(path)
+            footage = Footage(name, path, clip=clip)
             for instant, grey, following in _images(footage):
                 _look(footage, board, instant, grey, following)
             found.append(footage)
@@ -132,7 +147,8 @@ def read_footage(
 
 def _images(footage: Footage) -> Iterator[tuple[int, Grey, Grey | None]]:
     """Yield the instants and grey images of a camera, and the frame after each if it is a video."""
-    if not footage.video:
+    clip = footage.clip
+    if clip is None:
         files = [file for file in sorted(footage.path.iterdir()) if _is_picture(file)]
         numbers: dict[int, Path] = {}
         for file in files:
@@ -143,33 +159,31 @@ def _images(footage: Footage) -> Iterator[tuple[int, Grey, Grey | None]]:
                 raise CalibrationError(f"{footage.path}: {numbers[number].name} and {file.name} have the same number")
             numbers[number] = file
         for number, file in sorted(numbers.items()):
-            grey = _grey(read_picture(file, is_mask=False))
-            height, width = grey.shape
+            picture = _grey(read_picture(file, is_mask=False))
+            height, width = picture.shape
             if footage.width and (width, height) != (footage.width, footage.height):
                 size = f"{footage.width}×{footage.height}"
                 raise CalibrationError(f"{file}: is {width}×{height}; the pictures before it are {size}")
             footage.width, footage.height = width, height
-            yield number, grey, None
+            yield number, picture, None
         return
-    clip = probe_video(footage.path)
     footage.width, footage.height = clip.width, clip.height
     step = max(1, -(-clip.frame_count // _LOOKS))
-    reader, out = clip.open(), np.empty((clip.height, clip.width, 3), np.uint8)
-    try:
-        waiting: tuple[int, Grey] | None = None  # for the frame that follows
-        for instant in range(clip.frame_count):
-            if instant % step > 1:
-                reader.skip()
-                continue
-            reader.read(out)
-            grey = _grey(out)
+    wanted = np.array([k for k in range(clip.frame_count) if k % step <= 1])
+    blank = (clip.shown(wanted) < 0).tolist()
+    waiting: tuple[int, Grey] | None = None  # for the frame that follows
+    out = np.empty((clip.height, clip.width, 3), np.uint8)
+    with closing(Images(clip, wanted)) as images:
+        for place, instant in enumerate(wanted.tolist()):
+            grey: Grey | None = None
+            if not blank[place]:
+                images.read(place, out)
+                grey = _grey(out)
             if waiting is not None:
                 yield *waiting, grey
-            waiting = (instant, grey) if instant % step == 0 else None
+            waiting = (instant, grey) if grey is not None and instant % step == 0 else None
         if waiting is not None:
             yield *waiting, None
-    finally:
-        reader.close()
 
 
 def _grey(picture: NDArray[Any]) -> Grey:

@@ -188,7 +188,7 @@ def _worst(done: Calibrated) -> Iterable[str]:
         marks = "" if left_out else _marks(done, view, radius)
         picture = _svg(footage.width, footage.height, _picture(done, view.camera, view.instant) + frame + marks)
         what = "contradicts the others, not used" if left_out else f"{_error(done, view):.2f} px"
-        text = f"{footage.name}, {'frame' if footage.video else 'picture'} {view.instant}: {what}"
+        text = f"{footage.name}, {'frame' if footage.clip is not None else 'picture'} {view.instant}: {what}"
         yield f"<figure><figcaption>{html.escape(text)}</figcaption>{picture}</figure>"
 
 

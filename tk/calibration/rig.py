@@ -25,6 +25,8 @@ Float = NDArray[np.float64]
 _CONTRADICTS, _CONTRADICTS_PX = 5.0, 0.7
 #: most rounds in which contradicting views are removed
 _ROUNDS = 4
+#: images of two cameras in which the board is less apart are copies, pixels: encoding again moves points by less
+_COPY_PX = 1.0
 #: default for the largest number of instants
 MOST_INSTANTS = 120
 
@@ -113,6 +115,7 @@ def calibrate(
         raise CalibrationError(explain_miss(missing[0], board, [other.name for other in missing[1:]]))
     chosen, notes = choose(footages, options.instants, options.floor)
     views = [_view(c, instant, board, footages[c]) for instant, cameras in chosen.items() for c in cameras]
+    _check_copies(views, footages)
     fitted = []
     for c, footage in enumerate(footages):
         progress(f"estimating the intrinsics of camera {footage.name}")
@@ -135,11 +138,36 @@ def calibrate(
     views = [view for view in views if view.instant in state.boards]
     progress("adjusting all cameras and boards")
     solved, kept, dropped = _adjust(state, views)
+    _check_still_connected(names, kept, dropped)
     _check_sides(names, solved.state, kept)
     world = place_world(solved.state, board, options.floor)
     return Calibrated(
         board, tuple(footages), tuple(fitted), tuple(links), solved, world, tuple(kept), tuple(dropped), tuple(notes)
     )
+
+
+def _check_copies(views: Sequence[View], footages: Sequence[Footage]) -> None:
+    """Refuse two cameras with the same images, as they are after a file was copied under another name.
+
+    Raises:
+        CalibrationError: the board's points are at the same pixels in both.
+    """
+    own: list[dict[int, View]] = [{v.instant: v for v in views if v.camera == c} for c in range(len(footages))]
+    for b in range(len(own)):
+        for a in range(b):
+            shared = own[a].keys() & own[b].keys()
+            apart = [_apart_px(own[a][instant], own[b][instant]) for instant in shared]
+            if len(apart) > 1 and np.median(apart) < _COPY_PX:
+                raise CalibrationError(
+                    f"camera {footages[b].name}: has the same images as camera {footages[a].name}: the board is at the "
+                    f"same pixels in {len(shared)} instants; was a file copied? Give {footages[b].path} its own images"
+                )
+
+
+def _apart_px(a: View, b: View) -> float:
+    """Return the median distance of the points that two images show, pixels; infinite without any."""
+    _, of_a, of_b = np.intersect1d(a.ids, b.ids, return_indices=True)
+    return float(np.median(np.linalg.norm(a.pixels[of_a] - b.pixels[of_b], axis=1))) if len(of_a) else np.inf
 
 
 def _view(c: int, instant: int, board: Board, footage: Footage) -> View:
@@ -198,6 +226,29 @@ def _adjust(state: State, views: Sequence[View]) -> tuple[Solved, list[View], li
         boards = {i: pose for i, pose in solved.state.boards.items() if i in instants}
         solved = adjust(replace(solved.state, boards=boards), kept, solved.noise_px)
     return solved, kept, dropped
+
+
+def _check_still_connected(names: Sequence[str], kept: Sequence[View], dropped: Sequence[View]) -> None:
+    """Refuse cameras that contradict the others in so many views that the rest do not connect them.
+
+    Raises:
+        CalibrationError: names the smaller group of cameras.
+    """
+    groups = [{c} for c in range(len(names))]
+    for instant in {view.instant for view in kept}:
+        cameras = {view.camera for view in kept if view.instant == instant}
+        joined = set[int]().union(*(group for group in groups if group & cameras))
+        groups = [*(group for group in groups if not group & cameras), joined]
+    apart = sorted(set(range(len(names))) - max(groups, key=len))
+    if apart:
+        views = (*kept, *dropped)
+        others = {view.instant for view in views if view.camera not in apart}
+        count = len({view.instant for view in views if view.camera in apart} & others)
+        which = ", ".join(names[c] for c in apart)
+        raise CalibrationError(
+            f"camera {which}: contradicts the others in all {count} instants that they share: the images "
+            "are of other instants, another board is in view, or the camera was moved"
+        )
 
 
 def _check_sides(names: Sequence[str], state: State, views: Sequence[View]) -> None:

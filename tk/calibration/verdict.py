@@ -221,21 +221,29 @@ def _expected_error(done: Calibrated, rig: Rig, points: Float, covariance: Float
 def _blame(done: Calibrated) -> list[list[int]]:
     """Return for each camera the instants whose contradiction it explains.
 
-    Two cameras that contradict each other do not tell which one is wrong. The camera that takes part in most
-    contradictions explains them, then the one in most of the others, and so on.
+    Where two cameras and more agree, the other views of the instant are wrong. Two cameras that contradict each other
+    do not tell which one is wrong: the camera that takes part in most contradictions explains them, then the one in
+    most of the others, and so on.
     """
-    members: dict[int, set[int]] = {view.instant: set() for view in done.dropped}
-    for view in (*done.views, *done.dropped):
-        if view.instant in members:
-            members[view.instant].add(view.camera)
+    agree: dict[int, set[int]] = {}
+    for view in done.views:
+        agree.setdefault(view.instant, set()).add(view.camera)
+    suspects: dict[int, set[int]] = {}  # of the instants where nobody agrees
+    cases: list[tuple[int, set[int]]] = []
+    for view in done.dropped:
+        if len(agree.get(view.instant, ())) > 1:
+            cases.append((view.instant, {view.camera}))
+        else:
+            suspects.setdefault(view.instant, set(agree.get(view.instant, ()))).add(view.camera)
+    cases += suspects.items()
     found: list[list[int]] = [[] for _ in done.names]
     taken = [sum(view.camera == c for view in (*done.views, *done.dropped)) for c in range(len(found))]
-    while members:
-        counts = [sum(c in cameras for cameras in members.values()) for c in range(len(found))]
+    while cases:
+        counts = [sum(c in cameras for _, cameras in cases) for c in range(len(found))]
         # of two with as many, the one with fewer other views
         worst = max(range(len(found)), key=lambda c: (counts[c], counts[c] / max(taken[c], 1)))
-        found[worst] = sorted(instant for instant, cameras in members.items() if worst in cameras)
-        members = {instant: cameras for instant, cameras in members.items() if worst not in cameras}
+        found[worst] = sorted(instant for instant, cameras in cases if worst in cameras)
+        cases = [(instant, cameras) for instant, cameras in cases if worst not in cameras]
     return found
 
 
@@ -365,8 +373,9 @@ def _when(done: Calibrated, name: str) -> str:
     bad = _blame(done)[c]
     others = {view.instant for view in done.views if view.camera != c}
     good = sorted({view.instant for view in done.views if view.camera == c} & others - set(bad))
+    asked = "was the camera moved or zoomed there?"
     if bad and good and bad[0] > good[-1]:
-        return f", all from instant {bad[0]} on: was the camera moved there? Calibrate again with the images after it"
+        return f", all from instant {bad[0]} on: {asked} Calibrate again with the images after it"
     if bad and good and bad[-1] < good[0]:
-        return f", all up to instant {bad[-1]}: was the camera moved there? Use the images after it"
+        return f", all up to instant {bad[-1]}: {asked} Use the images after it"
     return ": the board was moved, the images are of other instants, or another board is in view"

@@ -34,7 +34,10 @@ def batch(
     quiet: bool,
     **given: Any,
 ) -> None:
-    """Track many captures into FOLDER and write a summary; after an interruption, the same command continues."""
+    """Track many captures into FOLDER and write a summary; after an interruption, the same command continues.
+
+    A CAPTURE may be a session: a folder of captures with session.toml.
+    """
     from tk.batch import exit_code, run_batch
 
     options = base.recording_options(**given)

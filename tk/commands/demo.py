@@ -9,17 +9,32 @@ import click
 from tk.commands import base
 from tk.commands.console import ConsoleReporter
 from tk.commands.track import draw_video_and_report, end, later_stages
+from tk.errors import ConfigError
 
 
 @click.command(epilog=base.example("tk demo"))
-@click.option("-o", "--output", default="demo.h5", show_default=True, type=base.PATH)
+@click.option("-o", "--output", type=base.PATH, help="Result; with --raw a folder.  [default: demo.h5; demo-raw]")
+@click.option(
+    "--raw", is_flag=True,
+    help="Begin with raw videos: synchronise, calibrate and track what five cameras recorded.",
+)  # fmt: skip
 @base.voxels_option
 @base.resume_option
 @base.force_option
 @base.no_report_option
 @base.quiet_option
-def demo(output: Path, voxels: int | None, resume: bool, force: bool, no_report: bool, quiet: bool) -> None:
+def demo(
+    output: Path | None, raw: bool, voxels: int | None, resume: bool, force: bool, no_report: bool, quiet: bool
+) -> None:
     """Track the capture that ships with tk and compare the result with its ground truth."""
+    if raw:
+        from tk.commands.demo_raw import run_raw
+
+        if voxels is not None or resume:
+            raise ConfigError("--voxels, --resume: have no meaning with --raw")
+        run_raw(output or Path("demo-raw"), force, quiet, no_report)
+        return
+    output = output or Path("demo.h5")
     from importlib.resources import as_file, files
 
     with as_file(files("tk") / "data" / "demo") as folder:

@@ -36,10 +36,10 @@ def evaluate(result: Path, truth: Path, capture: Path | None, joints: base.Names
         from tk.evaluation.joints import evaluate as evaluate_one
         from tk.evaluation.people import evaluate_people
         from tk.evaluation.views import capture_of, evaluate_views
-        from tk.io.results.reader import read_people
+        from tk.io.results.reader import read_people, read_truth
         from tk.model.body.joints import ANKLE_JOINTS
 
-        people, true = read_people(result), read_people(truth)
+        people, true = read_people(result), read_truth(truth)
         several = len(people) > 1 or len(true) > 1
         found: Evaluation | PeopleEvaluation = (
             evaluate_people(people, true) if several else evaluate_one(people[0], true[0])

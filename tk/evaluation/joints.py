@@ -41,7 +41,7 @@ from tk.evaluation.details import (
     sigma_shares,
 )
 from tk.io.results.data import JointTrack
-from tk.io.results.reader import read_joints
+from tk.io.results.reader import read_joints, read_truth
 from tk.io.results.status import Status, has_pose
 from tk.model.body.joints import HINGE_KINDS, HIPS, JOINTS, LIMB_JOINTS, SHOULDERS
 
@@ -162,7 +162,7 @@ class Evaluation:
 
 def evaluate_files(result: str | os.PathLike[str], truth: str | os.PathLike[str]) -> Evaluation:
     """Compare a result file with a ground truth file; see :func:`evaluate`."""
-    return evaluate(read_joints(result), read_joints(truth))
+    return evaluate(read_joints(result), read_truth(truth)[0])
 
 
 def evaluate(result: JointTrack, truth: JointTrack) -> Evaluation:

@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError, ConfigError
 from tk.evaluation.joints import plain_values
 from tk.io.captures.capture import Capture, open_capture
+from tk.io.captures.session import inherited
 from tk.io.results.data import Result
-from tk.io.results.reader import as_damage_error, read_joints, read_result
+from tk.io.results.reader import as_damage_error, read_result, read_truth
 from tk.model.body.joints import ANKLE_JOINTS, JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.cues.ray_costs import RayGrid
@@ -118,7 +119,7 @@ def evaluate_views(
     for name in joints:
         if name not in JOINTS:
             raise ConfigError(f"joint {name!r} is unknown: choose from {', '.join(JOINTS)}")
-    found, true = read_result(result), read_joints(truth)
+    found, true = read_result(result), read_truth(truth)[0]
     opened = open_capture(capture, None, masks, found.resampled)
     common, rows, true_rows = np.intersect1d(found.frames, true.frames, return_indices=True)
     if len(common) == 0 or common[-1] >= opened.frame_count:
@@ -183,7 +184,7 @@ def _silhouette_errors(result: Result, capture: Capture) -> tuple[list[float] | 
 def capture_of(truth: str | os.PathLike[str]) -> Path | None:
     """Return the capture folder that contains the ground truth file; None if there is none."""
     folder = Path(truth).parent
-    return folder if (folder / "calibration.toml").is_file() else None
+    return folder if inherited(folder, "calibration.toml").is_file() else None
 
 
 def _percent(value: float | None) -> str:

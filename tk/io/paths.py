@@ -16,10 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tk.errors import ConfigError, ExportError, TkError, unwritable
+from tk.io.toml import load_toml
 
 #: files and folders of a capture that tk reads
 _CAPTURE_PARTS = (
-    "calibration.toml", "capture.toml", "truth.h5", "videos", "images", "background", "masks", "timestamps",
+    "calibration.toml", "capture.toml", "session.toml", "truth.h5", "videos", "images", "background", "masks",
+    "timestamps",
 )  # fmt: skip
 
 
@@ -99,6 +101,7 @@ def check_not_input(path: Path, inputs: Iterable[Path | None] = (), capture: Pat
     given = [part for part in inputs if part is not None]
     if capture is not None:
         given += [part for pattern in _CAPTURE_PARTS for part in sorted(capture.glob(pattern))]
+        given += referred_files(capture)
     for part in given:
         real = resolved(part)
         if target == real or (real in target.parents and real.is_dir()):
@@ -110,6 +113,18 @@ def check_not_input(path: Path, inputs: Iterable[Path | None] = (), capture: Pat
             if _identity(file) == identity:
                 raise ConfigError(f"{path}: is the same file as an input of this command, {file}; choose another name")
     return target
+
+
+def referred_files(capture: Path) -> list[Path]:
+    """Return the files that `[videos]` in a capture's `capture.toml` names; who reads the capture reports errors."""
+    try:
+        videos = load_toml(capture / "capture.toml").get("videos")
+    except TkError:
+        return []
+    tables = videos.values() if isinstance(videos, dict) else ()
+    given = [table.get("path") for table in tables if isinstance(table, dict)]
+    paths = [path for own in given for path in (own if isinstance(own, list) else [own])]
+    return [capture / path for path in paths if isinstance(path, str)]
 
 
 @contextlib.contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import importlib
 import math
 import sys
@@ -22,7 +23,7 @@ _toml = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "t
 LARGE = 1e9
 
 #: most bytes of a TOML file. A calibration has some hundred a camera; a larger file was not written by a person.
-_MOST_BYTES = 2**24
+MOST_BYTES = 2**24
 
 
 def load_toml(path: Path, error: type[TkError] = CaptureError) -> dict[str, Any]:
@@ -34,14 +35,15 @@ def read_text(path: Path, error: type[TkError] = CaptureError) -> str:
     """Return the text of a small file. Raises ``error`` if it cannot be read, is large, or is not a file (a pipe would
     never end).
 
-    A byte order mark, which Windows editors write, is skipped.
+    A byte order mark, which Windows editors write, is skipped; with that of UTF-16 the text is read as such.
     """
     try:
         if path.exists() and not path.is_file():
             raise error(f"{path}: cannot be read (it is not a file)")
-        if path.stat().st_size > _MOST_BYTES:
-            raise error(f"{path}: has more than {_MOST_BYTES // 2**20} MiB; it is not a file that a person wrote")
-        return path.read_bytes().decode("utf-8-sig")
+        if path.stat().st_size > MOST_BYTES:
+            raise error(f"{path}: has more than {MOST_BYTES // 2**20} MiB; it is not a file that a person wrote")
+        content = path.read_bytes()
+        return content.decode("utf-16" if content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig")
     except OSError as reason:
         raise error(f"{path}: cannot be read ({reason.strerror or reason})") from None
     except UnicodeDecodeError:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from tk.evaluation.joints import Evaluation, evaluate, plain_values
 from tk.evaluation.people import evaluate_people
 from tk.io.results.data import Result
-from tk.io.results.reader import joint_tracks, positions_at, read_people
+from tk.io.results.reader import joint_tracks, positions_at, read_truth
 from tk.io.results.status import STATUS_MEANING, Status
 from tk.model.body.expected_error import in_cm, mean_range
 from tk.model.body.joints import BONE_ENDS, HINGES, JOINTS, LIMB_JOINTS, SEGMENTS
@@ -217,7 +217,7 @@ def _errors(result: Result, people: Sequence[Result], truth: Path | None) -> lis
     errors: list[dict[str, Any] | None] = [None] * len(people)
     if truth is None or not truth.exists():
         return errors
-    found, true = joint_tracks(result), read_people(truth)
+    found, true = joint_tracks(result), read_truth(truth)
     positions = positions_at(people[0].frames, true)
     if not np.isfinite(positions).any():
         return errors

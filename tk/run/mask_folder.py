@@ -72,7 +72,14 @@ def write_masks(
         segmenter = installed[0]
     _check_folder(capture, folder)
     made = PeopleMasks(load(segmenter), segmenter, capture.rig, capture.volume)
-    _claim(folder, {"capture": capture.name, "segmenter": segmenter, "cameras": list(capture.rig.names)})
+    origin: dict[str, str | list[str]] = {
+        "capture": capture.name,
+        "segmenter": segmenter,
+        "cameras": list(capture.rig.names),
+    }
+    if capture.clock is not None:
+        origin["clock"] = capture.clock.text
+    _claim(folder, origin)
     missing = [k for k in range(start, stop) if not all(_file(folder, n, k).exists() for n in capture.rig.names)]
     reporter.begin(stop - start, stop - start - len(missing))
     empty = dict.fromkeys(capture.rig.names, 0)

@@ -180,7 +180,15 @@ class Plan:
             "initial pose (its hash)": hashed([s.init for s in setup.subjects]),
             "stored hull": "yes" if options.store_hull else "no",
             "people": describe(options.people),
+            "videos and times of the frames (their hash)": hashed(_read_from(source)),
         }
+
+
+def _read_from(source: Source) -> Sequence[str | None]:
+    """Return the files outside a capture's folder, and the clock on which frames were chosen from files."""
+    if not isinstance(source, Capture) or source.clock is None:
+        return (None,)
+    return (source.clock.text, *source.videos)
 
 
 @contextmanager

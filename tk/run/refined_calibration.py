@@ -67,6 +67,8 @@ def refine_capture(
             f"{result}: has too few consecutive tracked frames to refine {capture.path}; {FEWEST} are needed"
         )
     read = np.array(capture.late_frames) / capture.fps
-    late = read + done.offset_frames / capture.fps
+    # what is new is added to the file's delays: those of the capture may include distances from its clock's frames
+    new = read + done.offset_frames / capture.fps - capture.time_offset_s
+    late = new + (capture.calibration.time_offset_s or 0.0)
     write_calibration(output, capture.calibration, world.rig_out(done.rig.recorded()), late.tolist())
     return done

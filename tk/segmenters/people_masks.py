@@ -11,7 +11,8 @@ one person if a square shows several, and misses people whom others hide. The ca
    gets the square around the hull.
 3. The people who are found are painted over, and the search is repeated until nobody new is found. Detections that
    match no other camera's are people whom one camera shows. Where a person's landmarks in a camera show somebody else
-   than in most cameras, the segmenter gets the square around the points that these cameras show.
+   than in most cameras, the segmenter gets the square around the points that these cameras show. A further answer of
+   the segmenter counts only if the cameras agree no less on the person's landmarks.
 4. Where somebody else stands in a person's square, the segmenter gets the square again, with everybody else painted
    over.
 
@@ -73,14 +74,12 @@ class _Person:
         patches: one per camera.
         masks, uncertain: (C, H, W) uint8, 0 or 255, and bool.
         landmarks: (C, L, 3) x, y, pixels, and visibility; NaN where there are none.
-        round: round of the search in which the person was found; those of earlier ones were painted over.
     """
 
     patches: list[Patch]
     masks: Images
     uncertain: Bool
     landmarks: NDArray[np.float64]
-    round: int
 
 
 class Segmented(NamedTuple):
@@ -143,11 +142,11 @@ class PeopleMasks:
         left = images.copy()
         people: list[_Person] = []
         sightings: list[list[Sighting]] = [[] for _ in self._rig]
-        for number in range(_ROUNDS):
+        for _ in range(_ROUNDS):
             for c, each in enumerate(sightings):
                 each += self._sightings(left, c)
             located, sightings = locate(self._rig, self._volume, sightings)
-            new = [person for seen in located if (person := self._look(left, seen, number, people))]
+            new = [person for seen in located if (person := self._look(left, seen, people))]
             if not new:
                 break
             people += new
@@ -183,9 +182,9 @@ class PeopleMasks:
         patches = [person.patch(camera, _BALL_MARGIN) for camera in self._rig]
         return [patch or whole for patch, whole in zip(patches, self._whole, strict=True)]
 
-    def _look(self, left: Images, seen: SeenPerson, number: int, people: Sequence[_Person]) -> _Person | None:
+    def _look(self, left: Images, seen: SeenPerson, people: Sequence[_Person]) -> _Person | None:
         """Return the masks of a person in the images that are left; None if they show nobody new."""
-        person = self._empty(self._patches(seen), number)
+        person = self._empty(self._patches(seen))
         for c in seen.cameras:
             self._segment(left, c, person)
         self._agree(left, person)
@@ -204,14 +203,13 @@ class PeopleMasks:
         """Where the landmarks show somebody else than in the other cameras, give the segmenter the square around the
         points that most cameras agree on: people who stand close together are sighted as one."""
         known = np.isfinite(person.landmarks[..., 0]).any(axis=1)
-        agree, points = consensus(self._rig, person.landmarks)
+        agree, points, _ = consensus(self._rig, person.landmarks)
         points = points[np.isfinite(points).all(axis=1)]
         for c in np.flatnonzero(known & ~agree).tolist() if agree.any() else ():
             pixels, _ = self._rig[c].project(points)
             pixels = pixels[np.isfinite(pixels).all(axis=1)]
             if len(pixels) > 1:
-                person.patches[c] = Patch.about(pixels, _HULL_MARGIN, person.patches[c].angle)
-                self._segment(images, c, person)
+                self._ask_again(images, c, person, Patch.about(pixels, _HULL_MARGIN, person.patches[c].angle))
 
     def _compare(self, images: Images, person: _Person) -> None:
         """Compare each mask with the hull of the others; where it shows somebody else, or the square fits badly, the
@@ -224,8 +222,7 @@ class PeopleMasks:
             better = Patch.about(expected, _HULL_MARGIN, patch.angle)
             missed = self._hull.share(others, c, person.masks[c]) < _LEAST_SHARE
             if missed or patch.side > _TOO_LARGE * better.side or not patch.holds(expected):
-                person.patches[c] = better
-                self._segment(images, c, person)
+                self._ask_again(images, c, person, better)
 
     def _new_views(self, person: _Person, people: Sequence[_Person]) -> Bool:
         """Return (C,) whether a camera shows enough of a person that nobody else's mask shows."""
@@ -237,18 +234,19 @@ class PeopleMasks:
 
     def _separate(self, images: Images, people: Sequence[_Person]) -> None:
         """Add what the segmenter sees of a person where others stood in the square and are now painted over."""
-        first = [person.masks.copy() for person in people]
         for person in people:
             for c in range(len(images)):
                 patch = person.patches[c]
                 beside = [p for p in people if p is not person and patch.holds(np.array([p.patches[c].center]))]
-                if all(other.round < person.round for other in beside):
-                    continue  # nobody is beside the person, or the others were painted over already
+                if not beside:
+                    continue
                 painted = images[c].copy()
-                for other, masks in zip(people, first, strict=True):
+                for other in people:
                     if other is not person:
-                        self._paint(painted, c, masks[c], other.patches[c])
-                found, person.landmarks[c] = self._seen(painted, c, person.patches[c])
+                        self._paint(painted, c, other.masks[c], other.patches[c])
+                found, landmarks = self._seen(painted, c, person.patches[c])
+                if not self._take(person, c, landmarks):
+                    continue
                 near = self._hull.near(self._hull.subject(person.masks, but=c), c, images.shape[1:3])
                 person.uncertain[c] |= (found > _UNCERTAIN) & near
                 person.masks[c][(found > 0.5) & near] = 255
@@ -260,14 +258,36 @@ class PeopleMasks:
         picture, person = self._shown(image, c), self._shown(grown, c) > 0
         picture[person] = cv2.mean(picture, (~person).view(np.uint8))[:3]
 
-    def _empty(self, patches: Sequence[Patch], number: int = 0) -> _Person:
+    def _empty(self, patches: Sequence[Patch]) -> _Person:
         shape = len(self._rig), *self._rig.frame_shape
         landmarks = np.full((len(self._rig), len(LANDMARKS), 3), np.nan)
-        return _Person(list(patches), np.zeros(shape, np.uint8), np.zeros(shape, np.bool_), landmarks, number)
+        return _Person(list(patches), np.zeros(shape, np.uint8), np.zeros(shape, np.bool_), landmarks)
+
+    def _ask_again(self, images: Images, c: int, person: _Person, patch: Patch) -> None:
+        """Give the segmenter another square of a person in an image."""
+        found, landmarks = self._seen(images[c], c, patch)
+        if self._take(person, c, landmarks):
+            person.patches[c] = patch
+            self._put(person, c, found)
+
+    def _take(self, person: _Person, c: int, landmarks: NDArray[np.float64]) -> bool:
+        """Replace a person's landmarks in an image, unless the cameras then agree less: the network shows somebody
+        else. Return whether they were replaced."""
+        before, earlier = consensus(self._rig, person.landmarks).support, person.landmarks[c].copy()
+        person.landmarks[c] = landmarks
+        if consensus(self._rig, person.landmarks).support < before:
+            person.landmarks[c] = earlier
+            return False
+        return True
 
     def _segment(self, images: Images, c: int, person: _Person) -> None:
         """Give the segmenter the square of a person in an image; replace the mask and the landmarks."""
         found, person.landmarks[c] = self._seen(images[c], c, person.patches[c])
+        self._put(person, c, found)
+
+    @staticmethod
+    def _put(person: _Person, c: int, found: NDArray[np.float32]) -> None:
+        """Replace a person's mask in an image by the probabilities (H, W)."""
         person.masks[c] = np.where(found > 0.5, 255, 0)
         person.uncertain[c] = (found > _UNCERTAIN) & (found <= 0.5)
 

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from tk.errors import TkError
-from tk.io.captures import mask_store
 from tk.io.captures.mask_store import MaskStore
 from tk.kernels.mask_values import OTHERS
 
@@ -76,7 +75,8 @@ def test_a_frame_that_was_not_stored_is_a_key_error():
 
 def test_masks_beyond_the_memory_limit_go_to_an_unnamed_file(monkeypatch, tmp_path):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    monkeypatch.setattr(mask_store, "IN_MEMORY", 2000)
+    spooled = tempfile.SpooledTemporaryFile
+    monkeypatch.setattr(tempfile, "SpooledTemporaryFile", lambda _: spooled(2000))
     rng = np.random.default_rng(0)
     masks = (rng.random((12, 2, 30, 40)) < 0.5).astype(np.uint8) * 255
     store = MaskStore()

@@ -13,7 +13,7 @@ import pytest
 from tests.io.conftest import CENTER, look_at, picture, read_tag, write_video
 from tk.io.captures.calibration import camera_table
 from tk.io.captures.capture import Capture, open_capture
-from tk.io.importers import Imported, import_project
+from tk.io.importers import Imported, Wanted, import_project
 from tk.model.cameras.camera import Camera, Rig
 
 WIDTH, HEIGHT = 320, 240
@@ -90,9 +90,11 @@ class Import:
         unit: str | None = None,
         trial: str | None = None,
         order: list[int] | None = None,
+        scale: str | None = None,
+        tolerance_px: float = 0.01,
     ) -> Checked:
-        """Check that every camera of ``rig`` exists, projects within 0.01 px, and has its own video (``order``)."""
-        imported = import_project(folder, self.output, unit, trial)
+        """Check that every camera of ``rig`` exists, projects within a tolerance, and has its own video (``order``)."""
+        imported = import_project(folder, self.output, Wanted(unit, trial, scale))
         capture = open_capture(imported.path)
         assert imported.cameras == len(capture.rig) == len(rig)
         assert all("\n" not in note for note in imported.notes)
@@ -101,7 +103,7 @@ class Import:
             assert (camera.width, camera.height) == (true.width, true.height)
             expected, _ = true.project(p_world)
             assert np.isfinite(expected).all()
-            np.testing.assert_allclose(camera.project(p_world)[0], expected, atol=0.01)
+            np.testing.assert_allclose(camera.project(p_world)[0], expected, atol=tolerance_px, rtol=0)
         with capture.frames() as frames:
             seen = [[read_tag(image)[0] for image in frame.images[:, :HEIGHT, :WIDTH]] for frame in frames]
         assert seen == [order or list(range(len(rig)))] * FRAMES

@@ -12,6 +12,15 @@ import pytest
 from tests.conftest import refused
 from tests.io.conftest import write_toml
 from tests.io.importers.conftest import make_rig, projection_matrix, renamed, tables
+from tests.io.importers.test_calibration_formats import (
+    in_first,
+    write_calibio,
+    write_colmap,
+    write_mcal,
+    write_multical,
+    write_opencv,
+    write_stereo,
+)
 from tests.io.importers.test_other_formats import write_easymocap, write_panoptic
 from tests.io.importers.test_xml_formats import write_qca, write_xcp
 from tk.errors import CalibrationError, CaptureError
@@ -35,6 +44,13 @@ FORMATS: dict[str, Callable[[Path], object]] = {
     "qualisys": lambda folder: write_qca(folder / "x.qca.txt", RIG),
     "vicon": lambda folder: write_xcp(folder / "x.xcp", RIG, (1e-8, 0.0)),
     "projections": write_projections,
+    "multical": lambda folder: write_multical(folder, in_first(RIG)),
+    "calib.io": lambda folder: write_calibio(folder, in_first(RIG)),
+    "opencv yaml": lambda folder: write_opencv(folder, RIG),
+    "opencv json": lambda folder: write_opencv(folder, RIG, ".json"),
+    "stereo": lambda folder: write_stereo(folder, RIG),
+    "colmap": lambda folder: write_colmap(folder, RIG),
+    "optitrack": lambda folder: write_mcal(folder, RIG),
 }
 
 
@@ -70,6 +86,21 @@ FORMATS: dict[str, Callable[[Path], object]] = {
         ("qualisys", "x.qca.txt", 'r11="', 'r11="nan', "camera '26578': <transform>: r11 = 'nan"),
         ("qualisys", "x.qca.txt", 'r11="', 'r11="7" r="', "camera '26578': rotation is no rotation matrix"),
         ("qualisys", "x.qca.txt", 'active="1"', 'active="0"', "0 calibrated camera, and a capture needs at least 2"),
+        ("multical", "calibration.json", '"R": [[', '"R": [["x", ', "[camera_poses]: [26578]: R must be 3×3 numbers"),
+        ("multical", "calibration.json", "_to_26578", "_to_99", "must be the name of a camera, or two names with _to_"),
+        ("multical", "calibration.json", '"K": [[', '"K": [[-', "positive focal lengths"),
+        ("calib.io", "rig.json", '"cameras"', '"kameras"', "has no list of `cameras`"),
+        ("calib.io", "rig.json", '"f": {"state": 0, "val": ', '"f": {"val": -', "positive focal lengths"),
+        ("calib.io", "rig.json", "}]", "}", "invalid JSON"),
+        ("opencv yaml", "26579.yml", "data: [", "data: [ x, ", "camera_matrix must be 3×3 numbers"),
+        ("opencv yaml", "26579.yml", "data: [", "data: [[", "is not YAML as OpenCV writes it"),
+        ("opencv json", "26579.json", '"rows": 3', '"rows": 2', "camera_matrix must be 3×3 numbers"),
+        ("stereo", "extrinsics.yml", "T:", "Q:", "has no R and T, from the first camera to the second one"),
+        ("colmap", "cameras.txt", " OPENCV ", " FOV ", "line 2: 'FOV' is no lens model that tk reads"),
+        ("colmap", "cameras.txt", " OPENCV ", " RADIAL ", "line 2: RADIAL needs 5 parameters, f, cx, cy, k1, k2"),
+        ("colmap", "images.txt", " 26578.jpg", "", "line 3: must be an image (ten values, the last one its name)"),
+        ("colmap", "images.txt", " 2 26579.jpg", " 9 26579.jpg", "camera 9 is not in cameras.txt"),
+        ("colmap", "images.txt", "10 ", "10 nan ", "must hold finite numbers"),
         ("vicon", "x.xcp", "ORIENTATION=", "O=", "camera '26578': <KeyFrame>: ORIENTATION is missing"),
         ("vicon", "x.xcp", 'POSITION="', 'POSITION="x ', "camera '26578': <KeyFrame>: POSITION must be 3 numbers"),
         ("vicon", "x.xcp", 'SIZE="320 240"', 'SIZE="320"', "camera '26578': SENSOR_SIZE must be 2 numbers"),

@@ -51,7 +51,7 @@ def test_unknown_project_says_what_it_holds_and_what_was_searched(folder: Path, 
         import_project(folder, check.output)
     for form in FORMATS:
         assert form.patterns[0] in str(caught.value)
-    assert len(str(caught.value)) - len(str(folder)) < 3 * 120
+    assert len(str(caught.value)) - len(str(folder)) < 4 * 120
 
 
 @pytest.mark.parametrize("command", [["track", "-o", "r.h5"], ["inspect"]])

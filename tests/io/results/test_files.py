@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
 import signal
@@ -19,8 +20,7 @@ import pytest
 from tests.io.result_files import append, assert_complete, fail_after, resume, write
 from tests.io.result_victim import META
 from tk.errors import ResultError, TkError
-from tk.io import hdf5_writer
-from tk.io.results.reader import read_joints, read_result
+from tk.io.results.reader import read_joints, read_result, read_truth
 from tk.io.results.writer import ResultWriter
 
 ROOT = Path(__file__).parents[3]
@@ -65,7 +65,6 @@ def missing(path: Path) -> None:
         (other_software, "other software|neither"),
         (not_hdf5, "not an HDF5 file"),
         (of_version(4), "format_version is 4.*use a newer tk"),
-        (of_version(2), "format_version is 2.*version 3: track the capture again"),
         (truncated, "damaged"),
         (incomplete, "no /frames"),
         (missing, "no such file"),
@@ -80,6 +79,15 @@ def test_unusable_files_are_named(tmp_path: Path, make, message: str, read) -> N
         read(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_results_of_an_older_version_are_ground_truth_and_no_results(tmp_path: Path) -> None:
+    path = tmp_path / "some.h5"
+    of_version(2)(path)
+    for read in (read_result, read_joints):
+        with pytest.raises(ResultError, match=r"format_version is 2.*version 3: track the capture again"):
+            read(path)
+    assert np.isfinite(read_truth(path)[0].positions).all()
 
 
 @pytest.mark.parametrize(
@@ -239,14 +247,18 @@ def test_run_is_resumable_whenever_a_write_fails(path: Path, monkeypatch: pytest
 
 
 def test_interruption_while_hdf5_writes_takes_effect_afterwards(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(*arguments: Any) -> None:
-        os.kill(os.getpid(), signal.SIGINT)
-        original(*arguments)
+    pressed: list[bool] = []
 
-    original = hdf5_writer._write
+    class File(io.FileIO):
+        def write(self, data: Any) -> int:
+            if pressed:
+                os.kill(os.getpid(), signal.SIGINT)
+            return super().write(data)
+
+    monkeypatch.setattr(io, "FileIO", File)
     with pytest.raises(KeyboardInterrupt), ResultWriter.create(path, META) as writer:
         append(writer, 0)
-        monkeypatch.setattr(hdf5_writer, "_write", interrupt)
+        pressed.append(True)
         append(writer, 1)
     assert assert_complete(path, 2) == 2
 

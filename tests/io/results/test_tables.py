@@ -8,19 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import tk
-from tests.conftest import QUICK
 from tk.errors import ExportError
-from tk.io import settings_file
 from tk.io.results.data import Result
 from tk.io.results.reader import read_result
 from tk.model.body.joints import FOOT_POINTS
 
 
 @pytest.fixture(scope="module")
-def result(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Result:
-    path = tmp_path_factory.mktemp("tables") / "r.h5"
-    return tk.track(tk.open_capture(tiny), path, config=settings_file.from_toml(QUICK), frames=(2, 5), causal=True)
+def result(causal: Path) -> Result:
+    return read_result(causal).at_rows(np.arange(2, 5))
 
 
 def test_table_has_one_row_per_frame_and_all_values_of_the_file(result: Result) -> None:

@@ -61,7 +61,7 @@ def test_cameras_with_fewer_than_two_others_have_no_evidence() -> None:
 
 def test_ratio_falls_with_the_distance_and_is_bounded() -> None:
     visible = np.full(21, 0.95)
-    ratios = [log_ratio(np.full(21, metres), visible) for metres in (0.0, 0.03, 0.1, 0.5, 5.0)]
+    ratios = [log_ratio(np.full((21, 2), [metres, 0.0]), visible).sum() for metres in (0.0, 0.03, 0.1, 0.5, 5.0)]
     assert ratios == sorted(ratios, reverse=True) and ratios[1] > 0 > ratios[3]
     assert ratios[3] - ratios[4] < 0.1 and np.isfinite(ratios[4])
 
@@ -120,7 +120,7 @@ def test_people_sighted_as_one_are_told_apart_by_most_cameras() -> None:
     one, other = (landmarks_of(RIG, BODY, pose, 0.02, seed=k) for k, pose in enumerate((POSES[0], apart)))
     mixed = one.copy()
     mixed[2] = other[2]
-    agree, points = consensus(RIG, mixed)
+    agree, points, _ = consensus(RIG, mixed)
     assert agree.tolist() == [True, True, False, True]
     assert np.nanmedian(np.linalg.norm(points - body_points(BODY, POSES[0]), axis=1)) < 0.05
     assert consensus(RIG, one)[0].all()
@@ -129,5 +129,54 @@ def test_people_sighted_as_one_are_told_apart_by_most_cameras() -> None:
 def test_no_camera_agrees_without_a_pair_that_shows_one_person() -> None:
     alone = np.full((4, 21, 3), np.nan)
     alone[1] = landmarks_of(RIG, BODY, POSES[0], 0.02)[1]
-    agree, points = consensus(RIG, alone)
+    agree, points, _ = consensus(RIG, alone)
     assert not agree.any() and np.isnan(points).all()
+
+
+# --- what other images leave open ---------------------------------------------------------------------------------
+
+
+def without(sets: np.ndarray, *cameras: int) -> np.ndarray:
+    """Return the landmarks (C, L, 3) without those of some cameras."""
+    result = sets.copy()
+    result[list(cameras)] = np.nan
+    return result
+
+
+def test_cameras_that_face_each_other_do_not_contradict_a_third_one() -> None:
+    half_turn = np.diag([-1.0, -1.0, 1.0])
+    facing = replace(RIG[0], name="facing", rotation=RIG[0].rotation @ half_turn)
+    rig = Rig((RIG[0], facing, RIG[1]))
+    np.testing.assert_allclose(facing.center[:2], -RIG[0].center[:2], atol=1e-9)
+    for seed in range(5):
+        one = landmarks_of(rig, BODY, POSES[0], 0.05, seed=seed)
+        assert (evidence_for_cameras(rig, [one[None]]) > 0).all()
+
+
+def test_set_of_somebody_else_does_not_contradict_the_cameras_that_agree() -> None:
+    below = POSES[1].copy()
+    below[:3] += [0.45, 0.3, -0.5]  # at one height, each two cameras would agree on a point between both people
+    one, other = (landmarks_of(RIG, BODY, pose, 0.02, seed=1)[[0, 1, 3]] for pose in (POSES[0], below))
+    three = Rig(tuple(RIG[c] for c in (0, 1, 3)))
+    mixed = one.copy()
+    mixed[2] = other[2]
+    evidence = evidence_for_cameras(three, [mixed[None]])
+    assert evidence[2] < 0 and not (evidence[:2] < 0).any()
+    found = associated(three, np.stack([mixed]))[0]
+    assert np.isnan(found[2]).all() and np.isfinite(found[:2]).all()
+
+
+def test_wrong_landmarks_of_another_image_are_not_held_against_a_camera() -> None:
+    one = landmarks_of(RIG, BODY, POSES[0], 0.02)
+    wrong = one.copy()
+    wrong[0, :6, :2] += 60.0
+    right, doubtful = (evidence_for_cameras(RIG, [without(sets, 3)[None]])[1] for sets in (one, wrong))
+    assert right > doubtful > 0
+
+
+def test_unknown_place_says_nothing() -> None:
+    away, visible = np.full((21, 2), 0.3), np.full(21, 0.95)
+    known, unknown = (
+        log_ratio(away, visible, np.tile(spread * np.eye(2), (21, 1, 1))).sum() for spread in (1e-6, 100.0)
+    )
+    assert known < -10 and abs(unknown) < 1.0

@@ -15,13 +15,13 @@ from tk.io.captures.mask_store import MaskStore
 from tk.kernels.cones import CONE
 from tk.model.body.body_parameters import BodyFamily, shapes_of
 from tk.model.body.cone_body import SHAPE_NUMBERS, group_of
-from tk.model.cameras import refinement
 from tk.model.cameras.agreement import camera_agreement
 from tk.model.cameras.bundle import TrackedPoses, camera_rows, choose_frames, farthest
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import closest_to_lines
 from tk.model.cameras.refinement import (
     MOVE_M,
+    SCALES,
     TURN_DEG,
     RefinementSettings,
     aligned,
@@ -35,13 +35,6 @@ from tk.run.refinement import refine_rig
 RIG = ring_of_cameras(4, width=320, height=400)
 FRAMES = 12
 QUICK = RefinementSettings()
-
-
-@pytest.fixture(autouse=True)
-def few_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The fine scale only."""
-    monkeypatch.setattr(refinement, "COARSE_ROUNDS", 0)
-    monkeypatch.setattr(refinement, "ROUNDS", 5)
 
 
 @cache
@@ -82,7 +75,7 @@ def tracked(poses: np.ndarray | None = None, usable: slice = slice(None)) -> Tra
 
 
 def frames(store: MaskStore, rig: Rig):
-    return choose_frames(store.get, Views(rig), BODY.skeleton, tracked(), FRAMES, 1, True)
+    return choose_frames(store.get, Views(rig), BODY.skeleton, tracked(), FRAMES, SCALES, True)
 
 
 def disturbed(camera: Camera, rng: np.random.Generator, deg: float = 0.25, metres: float = 0.01) -> Camera:
@@ -259,7 +252,7 @@ def test_two_cameras_of_which_one_is_turned_sideways_contradict_each_other(turne
     met = [closest_to_lines(wrong.centers, np.array(pair)) for pair in zip(*rays, strict=True)]
     poses = motion().copy()
     poses[:, [BODY.skeleton.names.index(f"torso_{axis}") for axis in "xyz"]] += np.array(met) - place
-    seen = choose_frames(in_time().get, Views(wrong), BODY.skeleton, tracked(poses), FRAMES, 1, True)
+    seen = choose_frames(in_time().get, Views(wrong), BODY.skeleton, tracked(poses), FRAMES, SCALES, True)
     contradiction = camera_agreement(BODY, wrong, seen).contradiction
     assert ("larger than" in contradiction) == (turned_deg != 0), contradiction
 

@@ -155,15 +155,21 @@ def test_padding_of_a_smaller_image_is_background(learned):
     assert not masks[1, 100:].any() and not masks[1, :, 140:].any()
 
 
-def test_specks_are_removed_and_small_holes_filled(learned, monkeypatch):
+def test_specks_are_removed_and_small_holes_filled(learned):
+    """In images twice as large."""
     scene, clips, _ = learned
-    image, truth = with_person(scene, (40, 40, 200))
-    image[0, 10, 10] = 0  # nine pixels after the 3×3 window
-    image[0, 50:52, 70:72] = scene[0, 50:52, 70:72]
-    monkeypatch.setattr("tk.model.masks.foreground.AREA_MIN", 12 / 19200)
-    masks = CollinearityForeground.learn(clips, SHAPE, SIZES).label(expose(image, np.random.default_rng(8)))[0]
-    assert not masks[0, :20, :20].any()
-    assert masks[0, 48:54, 68:74].all()
+
+    def larger(layers):
+        return layers.repeat(2, axis=1).repeat(2, axis=2)
+
+    image, truth = (larger(layers) for layers in with_person(scene, (40, 40, 200)))
+    image[0, 20, 20] = 0  # nine pixels after the 3×3 window
+    image[0, 100:102, 140:142] = larger(scene)[0, 100:102, 140:142]
+    shape = (2 * SHAPE[0], 2 * SHAPE[1])
+    foreground = CollinearityForeground.learn([larger(clip) for clip in clips], shape, 2 * SIZES)
+    masks = foreground.label(expose(image, np.random.default_rng(8)))[0]
+    assert not masks[0, :40, :40].any()
+    assert masks[0, 96:106, 136:146].all()
     assert iou(masks[0], truth[0]) > 0.93
 
 

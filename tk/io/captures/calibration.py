@@ -97,7 +97,7 @@ def read_calibration(path: str | Path) -> Calibration:
     """
     path = Path(path)
     if not path.exists():
-        raise CalibrationError(f"{path}: there is no such file; a capture needs its cameras' calibration")
+        raise CalibrationError(f"{path}: there is no such file; write it with tk calibrate, or copy it there")
     document = load_toml(path, CalibrationError)
     tables = camera_tables(document, path)
     return calibration_of(path, tables, given_unit(document, path))

@@ -12,19 +12,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import CalibrationError, CaptureError, VolumeError
+from tk.errors import CaptureError
 from tk.io.captures.calibration import Calibration, read_calibration
-from tk.io.captures.capture_toml import CaptureSettings, GivenSubject, read_settings
+from tk.io.captures.capture_toml import CaptureSettings, GivenSubject, Span, read_settings
 from tk.io.captures.clip import Clip
 from tk.io.captures.clip_folder import clips_of, open_clips, open_masks, read_some
+from tk.io.captures.clock import Clock, OnClock, put_on_clock
 from tk.io.captures.frames import FrameReader, FrameSet
-from tk.io.captures.timing import check_clock, read_stamps
-from tk.io.captures.timing import resample as resampled
+from tk.io.captures.referred import referred_clips, referred_stamps
+from tk.io.captures.scene import up_of, volume_of, warn_of_units
+from tk.io.captures.session import inherited, is_session, trials
+from tk.io.captures.timing import Stamps, check_clock, read_stamps
 from tk.io.captures.video import VideoClip, damaged_images, notes_on, odd_turn
 from tk.io.paths import text_of
 from tk.model.cameras.camera import Rig
-from tk.model.cameras.common_view import all_look_away, infer_volume, sample_box, views_of
-from tk.model.cameras.mounting import DEFAULT_UP, FoundUp
 from tk.model.cameras.up import shown, up_vector
 from tk.model.cameras.volume import Volume
 from tk.model.masks.image_health import described
@@ -48,12 +49,6 @@ _BACKGROUND_PIXELS, _BACKGROUND_BYTES = 50_000_000, 400_000_000
 #: most images of a video that are checked for damage after a camera has disagreed: about a millisecond each
 _CHECKED_IMAGES = 3000
 
-#: if `capture.toml` gives no up direction, the default counts unless the cameras' mounting differs by more, degrees
-_UP_DEG = 25.0
-
-#: metres; a note asks for the unit if cameras are farther apart, because their positions may be in millimetres
-_FAR_APART_M = 100.0
-
 
 @dataclass(frozen=True, repr=False)
 class Capture:
@@ -73,7 +68,9 @@ class Capture:
         warnings: lines about the capture that the user should read.
         clips: one clip for each camera.
         mask_clips: one clip of masks for each camera; None without given masks.
-        masks, resampled: arguments of :func:`open_capture`.
+        masks: argument of :func:`open_capture`.
+        clock: times of the frames, if they were chosen by time stamps; None: frame k is image k of each camera.
+        empty_clips: one clip of the empty scene for each camera, if a part of the recording shows it; else None.
         calibration: of the cameras that are used.
         time_offset_s: delay of each camera, seconds, from the calibration; :meth:`frames` corrects whole frames of it.
         segmenter: makes the masks if none are given; None: the empty scene, or an installed segmenter.
@@ -94,7 +91,8 @@ class Capture:
     clips: tuple[Clip, ...]
     mask_clips: tuple[Clip, ...] | None
     masks: str
-    resampled: bool
+    clock: Clock | None
+    empty_clips: tuple[Clip, ...] | None
     calibration: Calibration
     time_offset_s: tuple[float, ...]
     segmenter: Segmenter | None = None
@@ -133,6 +131,18 @@ class Capture:
         return replace(self, time_offset_s=(0.0,) * len(self.rig), frame_count=min(clip.frame_count for clip in clips))
 
     @property
+    def resampled(self) -> bool:
+        """Whether frames were chosen by time stamps."""
+        return self.clock is not None
+
+    @property
+    def videos(self) -> tuple[str, ...]:
+        """Names and sizes of files outside the folder that hold the images."""
+        files = [part.path for clip in self.clips for part in clip.parts]
+        outside = [file for file in files if self.path / "videos" != file.parent and file.is_file()]
+        return tuple(f"{file.resolve()} {file.stat().st_size}" for file in outside)
+
+    @property
     def subject_height_m(self) -> float | None:
         """Height of the first subject, metres; None if unknown."""
         return self.subjects[0].height_m
@@ -159,7 +169,7 @@ class Capture:
             return os.path.relpath(self.mask_clips[0].path.parent, self.path)
         if self.masks == "median":
             return "median"
-        return "none" if (self.path / "background").is_dir() else ""
+        return "none" if self.empty_clips or inherited(self.path, "background").is_dir() else ""
 
     def setup(self) -> Setup:
         """Return what `calibration.toml` and `capture.toml` say about the scene."""
@@ -182,9 +192,16 @@ class Capture:
         lines = []
         for camera in np.flatnonzero(cameras).tolist():
             clip, late = self.clips[camera], self.late_frames[camera]
-            if isinstance(clip, VideoClip) and (bad := damaged_images(clip, min(stop - late, _CHECKED_IMAGES))):
-                which = described(bad[0] + late, bad[-1] + late, len(bad))
-                lines.append(f"{clip.path}: is damaged in {which}; copy it again, or re-encode the original")
+            frames = np.arange(self.first_frame, min(stop, self.frame_count))[:_CHECKED_IMAGES]
+            numbers, first = clip.shown(frames - late), 0
+            for part in clip.parts:
+                own = numbers - first
+                own, first = np.where(own < part.frame_count, own, -1), first + part.frame_count
+                if isinstance(part, VideoClip) and (own >= 0).any():
+                    bad = damaged_images(part, int(own.max()) + 1, int(own[own >= 0].min()))
+                    if len(shown_bad := frames[np.isin(own, bad)]):
+                        which = described(int(shown_bad[0]), int(shown_bad[-1]), len(shown_bad))
+                        lines.append(f"{part.path}: is damaged in {which}; copy it again, or re-encode the original")
             if turn := odd_turn(clip, self.clips):
                 lines.append(f"{clip.path}: {turn}")
         return lines
@@ -201,8 +218,10 @@ class Capture:
         def smaller(clips: tuple[Clip, ...]) -> tuple[Clip, ...]:
             return tuple(clip.reduced(factor) for clip, factor in zip(clips, factors, strict=True))
 
-        masks = None if self.mask_clips is None else smaller(self.mask_clips)
-        return replace(self, rig=self.rig.reduced(factors), clips=smaller(self.clips), mask_clips=masks)
+        masks, empty = (clips and smaller(clips) for clips in (self.mask_clips, self.empty_clips))
+        return replace(
+            self, rig=self.rig.reduced(factors), clips=smaller(self.clips), mask_clips=masks, empty_clips=empty
+        )
 
     def frames(self, start: int = 0, stop: int | None = None) -> FrameReader:
         """Return the frames ``start`` … ``stop - 1``, decoded ahead; up to the capture's end by default.
@@ -224,7 +243,8 @@ class Capture:
         return FrameReader(self.clips, self.mask_clips, self.rig.frame_shape, wanted, self.late_frames, self.fps)
 
     def background(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return the empty scene: an array (T, h, w, 3) uint8 BGR for each camera; None without a `background/` folder.
+        """Return the empty scene: an array (T, h, w, 3) uint8 BGR for each camera; None without `[background]` and
+        without a `background/` folder.
 
         T is 1 for an image. Of a clip the first 32 frames are used; fewer, but at least 8, of many or large images,
         and fewer still if they would exceed 400 MB.
@@ -232,15 +252,16 @@ class Capture:
         Raises:
             VideoError: a camera has no background, or it cannot be read, or has another size.
         """
-        folder = self.path / "background"
-        if not folder.is_dir():
+        folder, small = inherited(self.path, "background"), self.empty_clips
+        if small is None and not folder.is_dir():
             return None
-        clips = clips_of(self.calibration, folder, "background", "png", pictures=True)
+        if small is None:
+            clips = clips_of(self.calibration, folder, "background", "png", pictures=True)
+            small = tuple(clip.reduced(camera.reduction) for clip, camera in zip(clips, self.rig, strict=True))
         pixels = sum(camera.width * camera.height for camera in self.rig)
         recorded = sum(camera.width * camera.height * camera.reduction**2 for camera in self.rig)
         most = min(_BACKGROUND_FRAMES, max(_LEAST_BACKGROUND, _BACKGROUND_PIXELS // recorded))
         most = min(most, max(2, _BACKGROUND_BYTES // (3 * pixels)))
-        small = [clip.reduced(camera.reduction) for clip, camera in zip(clips, self.rig, strict=True)]
         with ThreadPoolExecutor(os.cpu_count()) as threads:
             return tuple(threads.map(lambda clip: read_some(clip, most), small))
 
@@ -263,40 +284,49 @@ def open_capture(
     path, masks_asked = Path(path), masks
     if not path.is_dir():
         raise CaptureError(f"{path}: is not a folder; a capture is a folder with calibration.toml and videos/")
-    calibration = read_calibration(path / "calibration.toml").select(cameras)
+    if is_session(path):
+        raise CaptureError(
+            f"{path}: is a session of {len(trials(path))} captures; give one of them, or track all of them: "
+            f"tk batch {path} -o FOLDER"
+        )
+    known = read_calibration(inherited(path, "calibration.toml"))
+    calibration, file = known.select(cameras), path / "capture.toml"
     rig = calibration.rig
-    settings = read_settings(path / "capture.toml")
-    clips = open_clips(calibration, path)
-    mask_clips = open_masks(calibration, path, masks)
-    warnings: list[str] = [*calibration.notes, *notes_on(clips)]
-    if settings.unknown:
-        warnings.append(f"{path / 'capture.toml'}: unknown keys are ignored: {', '.join(settings.unknown)}")
-    _warn_of_units(calibration, warnings.append)
-    stamps = read_stamps(path, calibration, clips, settings.fps if settings.times == "fps" else None)
-    if resample:
-        clips, mask_clips, fps = resampled(clips, mask_clips, stamps, settings.fps, warnings.append)
+    settings = read_settings(file)
+    regular = settings.fps if settings.times == "fps" else None
+    if settings.videos:
+        clips, given = referred_clips(path, settings.videos, calibration, known)
+        stamps = referred_stamps(clips, given, regular)
     else:
-        found = check_clock(stamps, settings.fps, path / "capture.toml", warnings.append)
-        if found is None:
-            warnings.append(
-                f"{path / 'capture.toml'}: gives no fps, and neither do the pictures; {DEFAULT_FPS:g} is assumed"
-            )
-        fps = found or DEFAULT_FPS
+        clips = open_clips(calibration, path)
+        stamps = read_stamps(path, calibration, clips, regular)
+    mask_clips = open_masks(calibration, path, masks)
+    warnings: list[str] = [*settings.inherited, *calibration.notes, *notes_on(clips)]
+    if settings.unknown:
+        warnings.append(f"{file}: unknown keys are ignored: {', '.join(settings.unknown)}")
+    warn_of_units(calibration, warnings.append)
     offsets = calibration.time_offset_s or (0.0,) * len(rig)
+    timed: OnClock | None = None
+    if resample or settings.videos or settings.span != Span():
+        timed = _timed(path, settings, (clips, mask_clips), stamps, calibration, warnings.append)
+        clips, mask_clips, fps, offsets = timed.clips, timed.masks, timed.clock.fps, timed.late_s
+    else:
+        found = check_clock(stamps, settings.fps, file, warnings.append)
+        if found is None:
+            warnings.append(f"{file}: gives no fps, and neither do the pictures; {DEFAULT_FPS:g} is assumed")
+        fps = found or DEFAULT_FPS
     frame_count = _common_length(
         [*clips, *(mask_clips or ())], [round(late * fps) for late in offsets], warnings.append
     )
     if settings.init_frame >= frame_count:
-        raise CaptureError(
-            f"{path / 'capture.toml'}: [init]: frame = {settings.init_frame} is past the last frame, {frame_count - 1}"
-        )
+        raise CaptureError(f"{file}: [init]: frame = {settings.init_frame} is past the last frame, {frame_count - 1}")
     return Capture(
         path=path,
         name=settings.name or text_of(path.resolve().name),
         fps=fps,
-        up=_up(settings, calibration.mounting, path, warnings.append),
+        up=up_of(settings, calibration.mounting, path, warnings.append),
         rig=rig,
-        volume=_working_volume(settings, rig, path, warnings.append),
+        volume=volume_of(settings, rig, path, warnings.append),
         frame_count=frame_count,
         subjects=settings.subjects,
         init_frame=settings.init_frame,
@@ -306,10 +336,30 @@ def open_capture(
         clips=clips,
         mask_clips=mask_clips,
         masks=masks_asked,
-        resampled=resample,
+        clock=None if timed is None else timed.clock,
+        empty_clips=None if timed is None else timed.empty,
         calibration=calibration,
         time_offset_s=offsets,
     )
+
+
+def _timed(
+    path: Path,
+    settings: CaptureSettings,
+    images: tuple[tuple[Clip, ...], tuple[Clip, ...] | None],
+    stamps: Sequence[Stamps | None],
+    calibration: Calibration,
+    warn: Callable[[str], None],
+) -> OnClock:
+    """Return the ``images``, and masks, of a capture on a clock; delays of the calibration move the time stamps."""
+    if settings.span.empty and (path / "background").is_dir():
+        raise CaptureError(
+            f"{path / 'capture.toml'}: has [background], and the folder background/ is there, too; keep one of them"
+        )
+    late = calibration.time_offset_s or (0.0,) * len(stamps)
+    moved = [each and (each.moved(own) if any(late) else each) for each, own in zip(stamps, late, strict=True)]
+    recorded = dict(zip(calibration.rig.names, zip(images[0], moved, strict=True), strict=True))
+    return put_on_clock(recorded, images[1], settings, path / "capture.toml", warn)
 
 
 def _common_length(clips: Sequence[Clip], late: Sequence[int], warn: Callable[[str], None]) -> int:
@@ -330,48 +380,3 @@ def _common_length(clips: Sequence[Clip], late: Sequence[int], warn: Callable[[s
         short = ", ".join(str(clip.path) for clip in clips if clip.frame_count == common)
         warn(f"{short}: has {common} frames, others up to {max(counts)}; only the first {common} are used")
     return common
-
-
-def _up(settings: CaptureSettings, found: FoundUp, path: Path, warn: Callable[[str], None]) -> str:
-    """Return the axis of `capture.toml`; if it gives none, z, unless most cameras are mounted along another one."""
-    if settings.up is not None:
-        return settings.up
-    if not found.sure:
-        warn(f'{path / "capture.toml"}: gives no up, and {found.how}; write up = "{found.up}" if it is right')
-        return found.up
-    if up_vector(found.up) @ up_vector(DEFAULT_UP) > np.cos(np.radians(_UP_DEG)):
-        return DEFAULT_UP
-    warn(
-        f"{path / 'capture.toml'}: gives no up; {shown(found.up)} is taken, {found.how}; "
-        "tk calibrate --level looks closer"
-    )
-    return found.up
-
-
-def _working_volume(settings: CaptureSettings, rig: Rig, path: Path, warn: Callable[[str], None]) -> Volume:
-    """Return the volume from `capture.toml`, or the inferred one; at least two cameras must see a part of it."""
-    file = path / "capture.toml"
-    if settings.volume is None:
-        try:
-            volume = infer_volume(rig)
-        except VolumeError as reason:
-            if away := all_look_away(rig):
-                raise CalibrationError(f"{path / 'calibration.toml'}: {away}") from None
-            raise VolumeError(f"{file}: gives no [volume], and none can be inferred: {reason}; add one") from None
-        center, size = ([round(x, 2) for x in values] for values in (volume.center, volume.size))
-        warn(f"{file}: gives no [volume]; inferred from the cameras: center = {center}, size = {size} (metres)")
-        return volume
-    if not (views_of(rig, sample_box(settings.volume)) >= 2).any():
-        if away := all_look_away(rig):
-            raise CalibrationError(f"{path / 'calibration.toml'}: {away}")
-        raise VolumeError(
-            f"{file}: [volume]: no two cameras see center = {list(settings.volume.center)}, "
-            f"size = {list(settings.volume.size)}; move it (metres), or check the units in calibration.toml"
-        )
-    return settings.volume
-
-
-def _warn_of_units(calibration: Calibration, warn: Callable[[str], None]) -> None:
-    centers = calibration.rig.centers
-    if np.linalg.norm(np.ptp(centers, axis=0)) > _FAR_APART_M:
-        warn(f'{calibration.path}: the cameras are over {_FAR_APART_M:g} m apart; is [metadata] units = "mm" missing?')

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tk.errors import ConfigError, VolumeError
+from tk.io.captures.session import SESSION, described, merged, session_of
 from tk.io.toml import Table, load_toml
 from tk.model.cameras.up import up_text
 from tk.model.cameras.volume import Volume
@@ -26,11 +28,42 @@ FPS_RANGE = (0.01, 1e5)
 _MOST_VOLUME_M, _FARTHEST_M = 1000.0, 1e6
 
 _KEYS: dict[str, tuple[str, ...]] = {
+    "background": ("from", "to"),
     "volume": ("center", "size"),
     "subject": ("height", "position", "body", "init"),
     "init": ("frame", "pose", "keypoints"),
 }
-_TOP_KEYS = ("name", "fps", "times", "up", *_KEYS)
+_TOP_KEYS = ("name", "fps", "times", "up", "from", "to", "videos", *_KEYS)
+_VIDEO_KEYS = ("path", "offset", "rate")
+
+
+@dataclass(frozen=True)
+class GivenVideo:
+    """A video that is not in `videos/`: a table `[videos.NAME]`.
+
+    Attributes:
+        paths: its file, or its chapters in order, relative to the capture's folder.
+        offset_s, rate: an image is taken at offset_s + rate * own time, seconds of the capture's common time; own time
+            is its time stamp in the file.
+    """
+
+    paths: tuple[str, ...]
+    offset_s: float = 0.0
+    rate: float = 1.0
+
+
+@dataclass(frozen=True)
+class Span:
+    """The part of a recording that is used, in seconds of the common time; None: not given.
+
+    Attributes:
+        begin, end: the frames, ``end`` exclusive.
+        empty: begin and end of the part with the empty scene, which is the background.
+    """
+
+    begin: float | None = None
+    end: float | None = None
+    empty: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -64,7 +97,10 @@ class CaptureSettings:
         init_frame: the frame in which the subject stands in the initialisation pose.
         init_pose: one of :data:`INIT_POSES`.
         init_keypoints: folder of 2D keypoints of the first pose, relative to the capture's; None if there is none.
+        videos: the videos that are not in `videos/`, by name.
+        span: the part of the recording that is used.
         unknown: unknown keys, for example misspelt ones.
+        inherited: notes about what comes from the session.
     """
 
     name: str | None = None
@@ -76,19 +112,33 @@ class CaptureSettings:
     init_frame: int = 0
     init_pose: str = "da-vinci"
     init_keypoints: str | None = None
+    videos: Mapping[str, GivenVideo] = field(default_factory=dict)
+    span: Span = Span()
     unknown: tuple[str, ...] = ()
+    inherited: tuple[str, ...] = ()
 
 
 def read_settings(path: Path) -> CaptureSettings:
-    """Read `capture.toml`; a missing file counts as an empty one.
+    """Read `capture.toml`; a missing file counts as an empty one. A capture in a session inherits its settings.
 
     Raises:
         CaptureError: invalid TOML or a value out of range, with the file and the key.
         VolumeError: the working volume is empty.
     """
-    if not path.exists():
-        return CaptureSettings()
-    document = Table(load_toml(path), str(path))
+    own = load_toml(path) if path.exists() else {}
+    if (session := session_of(path.parent)) is None:
+        return _settings(path, own)
+    shared = _settings(session / SESSION, merged(path.parent, {}))  # before the trial's: its errors name its file
+    notes = described(path.parent, own)
+    if shared.unknown:
+        notes.append(f"{session / SESSION}: unknown keys are ignored: {', '.join(shared.unknown)}")
+    found = _settings(path, merged(path.parent, own))
+    return replace(found, unknown=_unknown_keys(own), inherited=tuple(notes))
+
+
+def _settings(path: Path, values: dict[str, Any]) -> CaptureSettings:
+    """Return the settings in a document; ``path``: the file that errors name."""
+    document = Table(values, str(path))
 
     fps = document.number("fps") if "fps" in document else None
     if fps is not None and fps <= 0:
@@ -122,8 +172,39 @@ def read_settings(path: Path) -> CaptureSettings:
         init_frame=init_frame,
         init_pose=init_pose,
         init_keypoints=init.text("keypoints", "") if "keypoints" in init else None,
+        videos=_videos(document.table("videos")),
+        span=_span(document),
         unknown=_unknown_keys(document.values),
     )
+
+
+def _videos(table: Table) -> dict[str, GivenVideo]:
+    videos = {}
+    for name in table.values:
+        video = table.table(name)
+        video.where = f"{table.where.removesuffix('[videos]')}[videos.{name}]"
+        paths = video.values.get("path")
+        paths = paths if isinstance(paths, list) else [paths]
+        if not paths or not all(isinstance(path, str) and path.strip() for path in paths):
+            video.fail("path must be the name of a file, or a list of the names of its chapters in order")
+        rate = video.number("rate", 1.0)
+        if rate <= 0:
+            video.fail(f"rate = {rate:g} must be positive; it is the seconds of the common time in one of the video's")
+        videos[name] = GivenVideo(tuple(paths), video.number("offset", 0.0), rate)
+    return videos
+
+
+def _span(document: Table) -> Span:
+    begin, end = (document.number(key) if key in document else None for key in ("from", "to"))
+    if begin is not None and end is not None and begin >= end:
+        document.fail(f"from = {begin:g} must be before to = {end:g}, seconds of the common time")
+    empty = None
+    if "background" in document:
+        table = document.table("background")
+        empty = table.number("from"), table.number("to")
+        if empty[0] >= empty[1]:
+            table.fail(f"from = {empty[0]:g} must be before to = {empty[1]:g}, seconds of the common time")
+    return Span(begin, end, empty)
 
 
 def _subjects(document: Table) -> tuple[GivenSubject, ...]:
@@ -180,6 +261,8 @@ def _unknown_keys(document: Any) -> tuple[str, ...]:
         found = document.get(table, {})
         for values in found if isinstance(found, list) else [found]:
             unknown += [f"{table}.{key}" for key in values if key not in keys]
+    for name, values in document.get("videos", {}).items():
+        unknown += [f"videos.{name}.{key}" for key in values if key not in _VIDEO_KEYS]
     return tuple(unknown)
 
 

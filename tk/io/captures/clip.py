@@ -38,6 +38,10 @@ class Reader(Protocol):
     def skip(self) -> None:
         """Skip the next image. Raises as :meth:`read` does."""
 
+    def jump(self, number: int) -> int:
+        """Skip images before image ``number`` as far as none has to be decoded. Return the number of the next image,
+        ``number`` at most, unless that was read before."""
+
     def close(self) -> None: ...
 
 
@@ -50,7 +54,7 @@ class Clip(ABC):
     height: int
     frame_count: int  # number of images
     is_mask: bool = False
-    # (N,) times of the images, seconds, increasing; None if the clip gives none
+    # (N,) times of the images, seconds, increasing, as the file gives them; None if it gives none
     times_s: NDArray[np.float64] | None = field(default=None, compare=False)
     recorded_size: tuple[int, int] | None = None  # width and height in the files, if the clip is reduced
     mask_form: MaskForm = field(default_factory=MaskForm, compare=False, repr=False)  # of a clip of masks
@@ -58,6 +62,11 @@ class Clip(ABC):
     @abstractmethod
     def open(self) -> Reader:
         """Return a reader at the first image."""
+
+    @property
+    def parts(self) -> tuple[Clip, ...]:
+        """The clips whose images follow one another in this one."""
+        return (self,)
 
     def shown(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the number of the image that each frame shows, the nearest before the start and after the end; -1 if

@@ -12,6 +12,7 @@ import numpy as np
 from tk.errors import CaptureError, VideoError
 from tk.io.captures.calibration import Calibration, match_camera
 from tk.io.captures.clip import Clip, Image
+from tk.io.captures.frames import Images
 from tk.io.captures.pictures import PICTURE_SUFFIXES, PictureClip, picture_number, probe_pictures
 from tk.io.captures.video import VIDEO_SUFFIXES, as_calibrated, probe_video
 from tk.model.cameras.camera import Camera
@@ -58,7 +59,7 @@ def open_clips(calibration: Calibration, path: Path) -> tuple[Clip, ...]:
     for folder in (path / "videos", path / "images"):
         if folder.is_dir():
             return clips_of(calibration, folder, "video" if folder.name == "videos" else "folder of pictures", "mp4")
-    raise VideoError(f"{path}: has neither videos/ nor images/")
+    raise VideoError(f"{path}: has neither videos/ nor images/, and its capture.toml no [videos]")
 
 
 def open_masks(calibration: Calibration, path: Path, masks: str) -> tuple[Clip, ...] | None:
@@ -105,20 +106,24 @@ def clips_of(
     with ThreadPoolExecutor(os.cpu_count()) as threads:
         clips = list(threads.map(lambda stem: probe(found[stem], is_mask), taken))
     for k, (clip, camera) in enumerate(zip(clips, taken.values(), strict=True)):
-        size = camera.width, camera.height
-        clip = clips[k] = as_calibrated(clip, size)
-        if (clip.width, clip.height) != size:
-            raise VideoError(
-                f"{clip.path}: is {clip.width}×{clip.height}, but {calibration.path.name} gives camera {camera.name!r} "
-                f"{camera.width}×{camera.height}; calibrate for this size or scale the pictures"
-            )
+        clips[k] = as_calibrated(clip, (camera.width, camera.height))
+        check_calibrated(clips[k], camera, calibration.path.name)
     return tuple(clips)
+
+
+def check_calibrated(clip: Clip, camera: Camera, calibration: str) -> None:
+    """Raise VideoError for images of another size than those of the calibration."""
+    if (clip.width, clip.height) != (camera.width, camera.height):
+        raise VideoError(
+            f"{clip.path}: is {clip.width}×{clip.height}, but {calibration} gives camera {camera.name!r} "
+            f"{camera.width}×{camera.height}; calibrate for this size or scale the pictures"
+        )
 
 
 def read_some(clip: Clip, most: int) -> Image:
     """Return the first frames of a clip, at most ``most``: (T, h, w, 3)."""
     result = np.empty((min(clip.frame_count, most), clip.height, clip.width, 3), np.uint8)
-    with closing(clip.open()) as reader:
-        for out in result:
-            reader.read(out)
+    with closing(Images(clip, np.arange(len(result)))) as images:
+        for k, out in enumerate(result):
+            images.read(k, out)
     return result

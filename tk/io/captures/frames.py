@@ -72,7 +72,7 @@ class FrameReader(Iterator[FrameSet]):
         for camera, clip in enumerate(clips):
             own = [clip] if mask_clips is None else [clip, mask_clips[camera]]
             frames = np.asarray(wanted) - (late[camera] if late else 0)
-            self._cameras.append([_Film(each, each.shown(frames), stop) for each in own])
+            self._cameras.append([Images(each, frames, stop) for each in own])
         # a thread knows its films, not this reader: dropping the reader ends the threads
         self._threads = [ThreadPoolExecutor(1, f"{_THREAD}{camera}") for camera in range(count)]
         films = [film for camera in self._cameras for film in camera]
@@ -155,23 +155,24 @@ class _Stacks:
         return stack.reshape(self._shape)
 
 
-class _Film:
-    """The images of a clip in the order in which the frames show them. One thread at a time.
+class Images:
+    """The images of a clip in the order in which some of its frames show them. One thread at a time.
 
     Args:
         clip: the images.
-        numbers: (F,) number of each frame's image, ascending; -1: the frame is blank.
+        frames: (F,) the frames, ascending.
         stop: once it is set, no further image is read.
     """
 
-    def __init__(self, clip: Clip, numbers: NDArray[np.int64], stop: threading.Event) -> None:
-        self._clip, self._numbers, self._stop = clip, numbers.tolist(), stop
+    def __init__(self, clip: Clip, frames: NDArray[np.int64], stop: threading.Event | None = None) -> None:
+        self._clip, self._numbers, self._stop = clip, clip.shown(frames).tolist(), stop or threading.Event()
         self._reader: Reader | None = None
         self._following = 0  # number of the next image in the clip
         self._kept: Image | None = None  # an image that several frames show
 
     def read(self, place: int, stack: Image) -> None:
-        """Write the image of a frame into the upper left of (H, W, 3), or (H, W) for a mask."""
+        """Write the image of ``frames[place]`` into the upper left of (H, W, 3), or (H, W) for a mask; black if the
+        frame is blank."""
         out, number = stack[: self._clip.height, : self._clip.width], self._numbers[place]
         if number < 0:
             out[...] = 0
@@ -179,6 +180,8 @@ class _Film:
             out[...] = self._kept
         else:
             reader = self._reader = self._reader or self._clip.open()
+            if self._following < number:
+                self._following = reader.jump(number)
             while self._following < number:
                 if self._stop.is_set():
                     return
@@ -194,13 +197,13 @@ class _Film:
             self._reader.close()
 
 
-def _decode(films: Sequence[_Film], place: int, layers: Sequence[Image]) -> None:
+def _decode(films: Sequence[Images], place: int, layers: Sequence[Image]) -> None:
     """Decode one camera's images of a frame; runs in the camera's thread."""
     for film, layer in zip(films, layers, strict=True):
         film.read(place, layer)
 
 
-def _shut(stop: threading.Event, threads: Sequence[ThreadPoolExecutor], films: Sequence[_Film]) -> None:
+def _shut(stop: threading.Event, threads: Sequence[ThreadPoolExecutor], films: Sequence[Images]) -> None:
     stop.set()
     # the garbage collector may call this from a decoding thread, which cannot wait for itself
     wait = not threading.current_thread().name.startswith(_THREAD)

@@ -33,7 +33,8 @@ class Contents:
         width, height: of the images, turned as the file asks for, pixels.
         first: the first images, as PyAV decodes them.
         frame_count: number of images that a decoder returns.
-        times_s: (N,) their times, seconds, increasing from 0; None if the file gives none.
+        times_s: (N,) their presentation time stamps, seconds, increasing; None if the file gives none.
+        keys: (K,) numbers of the images from which decoding can begin, increasing; none without times.
         undecodable: number of coded images before the first, in the order of the video, that a decoder does not return.
         turn: degrees, counter-clockwise, by which the file asks players to turn its images: 0, 90, 180 or 270.
         interlaced: whether images are marked as interlaced.
@@ -46,6 +47,7 @@ class Contents:
     first: tuple[Any, ...]
     frame_count: int
     times_s: NDArray[np.float64] | None
+    keys: NDArray[np.int64]
     undecodable: int
     turn: int
     interlaced: bool
@@ -165,14 +167,17 @@ def read_contents(path: Path) -> Contents:
     if interlaced or reordered_avi or _uncertain(packets):
         count, found = _count(path, packets)
         times = times if found is None else found
-    times = tick * (times[len(times) - count :] if len(times) >= count else np.empty(0))
+    times = times[len(times) - count :] if len(times) >= count else np.empty(0)
     increasing = len(times) == count and bool((np.diff(times) > 0).all())
+    ordered = increasing and not reordered_avi
+    begins = np.array([packet.time for packet in packets if packet.key and not packet.discarded and ordered])
     return Contents(
         width=images[0].height if turns % 2 else images[0].width,
         height=images[0].width if turns % 2 else images[0].height,
         first=tuple(images),
         frame_count=count,
-        times_s=times - times[0] if increasing else None,
+        times_s=tick * times if increasing else None,
+        keys=np.flatnonzero(np.isin(times, begins)),
         undecodable=shown - count,
         turn=90 * turns,
         interlaced=interlaced,

@@ -55,6 +55,10 @@ class _PictureReader:
     def skip(self) -> None:
         self._index += 1
 
+    def jump(self, number: int) -> int:
+        self._index = max(number, self._index)
+        return self._index
+
     def read(self, out: Image) -> None:
         clip = self._clip
         if self._index >= len(clip.files):
@@ -115,5 +119,5 @@ def _has_end(coded: bytes) -> bool:
     if not coded:
         return False
     if coded.startswith(b"\x89PNG"):
-        return b"IEND" in coded
+        return b"IEND\xaeB`\x82" in coded  # with its checksum
     return not coded.startswith(b"\xff\xd8") or b"\xff\xd9" in coded

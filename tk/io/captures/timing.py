@@ -1,8 +1,9 @@
-"""When images were taken: time stamps of the cameras, contradictions between them, and frames of a common clock.
+"""When images were taken: time stamps of the cameras, and contradictions between them.
 
 The times are those of `timestamps/<camera>.csv`, else those in the video files, or k / `fps` if `capture.toml` says so:
-the file of a video in slow motion gives the rate at which it is played. A camera's frame k is taken for the
-same moment as frame k of the others, so different rates are an error, unless the images are resampled.
+the file of a video in slow motion gives the rate at which it is played. Those of `[videos]` are moved and scaled to the
+common time. A camera's frame k is taken for the same moment as frame k of the others, so different rates are an error,
+unless frames are chosen on a clock (:mod:`tk.io.captures.clock`).
 """
 
 from __future__ import annotations
@@ -16,19 +17,21 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ClockError
 from tk.io.captures.calibration import Calibration, match_camera
-from tk.io.captures.clip import Clip, Reader
+from tk.io.captures.clip import Clip
 from tk.io.toml import read_text, shown
 
 Float = NDArray[np.float64]
 
 #: frame intervals by which the times of two cameras, or of `fps` and a video, may differ at the end of a recording.
 #: At one half, the nearest frame becomes another one.
-_DRIFT_FRAMES = 0.5
+DRIFT_FRAMES = 0.5
 #: relative difference between `fps` and a video that counts as rounding: 30 is written for 30000/1001, 0.1 % less
-_ROUNDED = 0.002
+ROUNDED = 0.002
+#: intervals longer than the median by this factor have a missing image in them
+_GAP = 1.5
 #: share of an interval by which a nearest image may be farther away than half an interval: time stamps are rounded,
 #: often to milliseconds
-_ROUNDED_INTERVAL = 0.05
+ROUNDED_INTERVAL = 0.05
 
 
 @dataclass(frozen=True)
@@ -53,12 +56,17 @@ class Stamps:
     @property
     def own_rate(self) -> float:
         """Rate of the camera, 1/s, also where single images are missing."""
-        return max(self.fps, 1.0 / float(np.median(np.diff(self.seconds))))
+        intervals = np.diff(self.seconds)
+        return 1.0 / float(intervals[intervals < _GAP * np.median(intervals)].mean())
 
     @property
     def since_start(self) -> Float:
         """(N,) times on the common clock, else since the first image."""
         return self.seconds if self.common else self.seconds - self.seconds[0]
+
+    def moved(self, offset_s: float, rate: float = 1.0) -> Stamps:
+        """Return the times offset_s + rate * seconds, on the common clock."""
+        return Stamps(self.path, offset_s + rate * self.since_start, common=True)
 
     @property
     def irregularity(self) -> float:
@@ -89,8 +97,13 @@ def read_stamps(
 
 
 def _of_container(clip: Clip, regular: float | None) -> Stamps | None:
-    times = clip.times_s if regular is None else np.arange(clip.frame_count) / regular
+    times = own_times(clip, regular)
     return Stamps(clip.path, times, common=False) if times is not None and len(times) > 1 else None
+
+
+def own_times(clip: Clip, regular: float | None) -> Float | None:
+    """Return the times of a clip's images as its file gives them, or at a ``regular`` rate, 1/s; None if unknown."""
+    return clip.times_s if regular is None else np.arange(clip.frame_count) / regular
 
 
 def _read(path: Path, clip: Clip) -> Stamps:
@@ -134,29 +147,29 @@ def check_clock(
     for other in known[1:]:
         count = min(len(first.seconds), len(other.seconds))
         apart = (other.since_start[:count] - first.since_start[:count]) * first.fps
-        if abs(apart[-1]) >= _DRIFT_FRAMES:
+        if abs(apart[-1]) >= DRIFT_FRAMES:
             raise _contradiction(
                 f"{other.path}: {other.fps:.5g} frames/s, and {first.path.name} {first.fps:.5g} frames/s: image "
                 f"{count - 1} is taken {abs(apart[-1]) / first.fps:.3g} s {'later' if apart[-1] > 0 else 'earlier'}; "
                 "record all cameras at one rate",
                 resample=True,
             )
-        if np.abs(apart).max() >= _DRIFT_FRAMES:
+        if np.abs(apart).max() >= DRIFT_FRAMES:
             warn(
                 f"{other.path}: its images are taken up to {np.abs(apart).max():.1f} frames before or after those of "
                 f"{first.path.name}; the option resample corrects that"
             )
-    measured = _nominal(float(np.median([each.fps for each in known])), len(first.seconds))
+    measured = nominal_rate(float(np.median([each.fps for each in known])), len(first.seconds))
     if fps is not None:
         drift = (len(first.seconds) - 1) * abs(measured / fps - 1)
-        if abs(fps / measured - 1) > _ROUNDED and drift >= _DRIFT_FRAMES:
+        if abs(fps / measured - 1) > ROUNDED and drift >= DRIFT_FRAMES:
             raise _contradiction(
                 f"{where}: fps = {fps:g}, but {first.path} has {measured:.5g} frames/s; remove fps, or correct it; if "
                 f'the videos play in slow motion what was recorded at {fps:g} frames/s, add times = "fps"',
                 resample=fps < measured,
             )
     for each in known:
-        if each.irregularity >= _DRIFT_FRAMES:
+        if each.irregularity >= DRIFT_FRAMES:
             warn(
                 f"{each.path}: has a variable frame rate: images are up to {each.irregularity:.1f} frames away from "
                 f"regular times; the option resample corrects that"
@@ -168,89 +181,9 @@ def _contradiction(message: str, resample: bool) -> ClockError:
     return ClockError(message, hint="or choose frames by their time stamps with --resample" if resample else "")
 
 
-def _nominal(fps: float, count: int) -> float:
+def nominal_rate(fps: float, count: int) -> float:
     """Return a whole rate, or 1000/1001 of one, if the measured rate differs only by rounded time stamps."""
     for nominal in (round(fps), round(1.001 * fps) / 1.001):
-        if abs(nominal / fps - 1) * count < _ROUNDED_INTERVAL:
+        if abs(nominal / fps - 1) * count < ROUNDED_INTERVAL:
             return float(nominal)
     return fps
-
-
-def resample(
-    clips: Sequence[Clip],
-    masks: Sequence[Clip] | None,
-    stamps: Sequence[Stamps | None],
-    fps: float | None,
-    warn: Callable[[str], None],
-) -> tuple[tuple[Clip, ...], tuple[Clip, ...] | None, float]:
-    """Return clips, and clips of masks, whose frame k is each camera's image nearest to time k / fps, and the rate.
-
-    The rate is ``fps``, else that of the slowest camera. A frame without an image within half an interval is blank.
-
-    Raises:
-        CaptureError: the times of a clip are unknown, the cameras have no time in common, or ``fps`` is above the rate
-            of each.
-    """
-    known: list[Stamps] = []
-    for clip, each in zip(clips, stamps, strict=True):
-        if each is None:
-            raise CaptureError(
-                f"{clip.path}: nothing gives the times of its images, so they cannot be resampled; add timestamps/"
-            )
-        known.append(each)
-    fastest = max(known, key=lambda each: each.own_rate)
-    if fps is not None and fps > (1 + _ROUNDED) * fastest.own_rate:
-        raise ClockError(
-            f"{fastest.path}: no camera has more than {fastest.own_rate:.5g} frames/s, so there is nothing to resample "
-            f"to fps = {fps:g} of capture.toml; remove fps, or correct it; if the videos play in slow motion what was "
-            f'recorded at {fps:g} frames/s, add times = "fps" and do not resample'
-        )
-    fps = fps or min(_nominal(each.fps, len(each.seconds)) for each in known)
-    begin = max(float(each.since_start[0]) for each in known)
-    pictures = [_nearest(each, begin, fps) for each in known]
-    if not all(len(numbers) for numbers in pictures):
-        raise CaptureError(f"{known[0].path}: the cameras have no time in common; check the time stamps")
-    missing = [f"{clip.path.stem} {(n < 0).sum()}" for clip, n in zip(clips, pictures, strict=True) if (n < 0).any()]
-    if any(not np.array_equal(numbers, np.arange(len(numbers))) for numbers in pictures):
-        warn(
-            f"resampled to {fps:.5g} frames/s by the time stamps"
-            + (f"; frames without an image: {', '.join(missing)}" if missing else "")
-        )
-    new = tuple(map(Resampled.of, clips, pictures))
-    if masks is not None:
-        masks = tuple(Resampled.of(mask, n[n < mask.frame_count]) for mask, n in zip(masks, pictures, strict=True))
-    return new, masks, fps
-
-
-def _nearest(stamps: Stamps, begin: float, fps: float) -> NDArray[np.int64]:
-    """Return the number of the image nearest to each frame of the clock; -1 where none is near enough."""
-    times = stamps.since_start
-    count = int(np.floor((times[-1] - begin) * fps + _DRIFT_FRAMES)) + 1
-    clock = begin + np.arange(max(count, 0)) / fps
-    after = np.clip(np.searchsorted(times, clock), 1, len(times) - 1)
-    # of two equally distant images the earlier one
-    nearest = np.where(clock - times[after - 1] <= times[after] - clock, after - 1, after)
-    far = np.abs(times[nearest] - clock) * fps > _DRIFT_FRAMES + _ROUNDED_INTERVAL
-    return np.where(far, -1, nearest)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Resampled(Clip):
-    """Images of a clip in another order of time."""
-
-    clip: Clip  # the images
-    pictures: NDArray[np.int64] = field(compare=False)  # (F,) see :meth:`shown`, never decreasing
-
-    @staticmethod
-    def of(clip: Clip, pictures: NDArray[np.int64]) -> Resampled:
-        """Return a clip whose frame k shows image ``pictures[k]``; -1: it is blank."""
-        return Resampled(clip.path, clip.width, clip.height, len(pictures), clip=clip, pictures=pictures)
-
-    def open(self) -> Reader:
-        return self.clip.open()
-
-    def shown(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
-        return self.pictures[super().shown(frames)]
-
-    def reduced(self, factor: int) -> Resampled:
-        return Resampled.of(self.clip.reduced(factor), self.pictures)

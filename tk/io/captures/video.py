@@ -7,7 +7,7 @@ interlaced ones, files whose packets are not all images, and files of which the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,10 @@ _FULL_RANGE = 2  # FFmpeg's AVCOL_RANGE_JPEG
 #: the first images of OpenCV and PyAV are compared at every so many pixels; the mean difference of right ones, which
 #: convert colours differently, is 1 at most, that of a black or a turned one 40
 _EVERY, _MOST_DIFFERENCE = 4, 8.0
+#: key images, the nearest first, from which decoding is tried: at the first ones of a gradual refresh images are not
+#: whole. After these the file is decoded from its start.
+_KEYS_TRIED = 4
+_WITHOUT_INDEX = ("mpegts", "mpeg")  # FFmpeg's names of containers
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,7 @@ class VideoClip(Clip):
         by_opencv: whether OpenCV decodes it; else PyAV.
         as_coded: whether the images are not turned.
         planar: whether the images consist of a plane of brightness and two planes of colours at half the size, 8 bits.
+        keys: (K,) numbers of the images from which decoding can begin, increasing; none without times.
     """
 
     turn: int = 0
@@ -51,6 +56,7 @@ class VideoClip(Clip):
     by_opencv: bool = True
     as_coded: bool = False
     planar: bool = False
+    keys: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64), compare=False, repr=False)
 
     def open(self) -> Reader:
         return _OpenCVReader(self) if self.by_opencv and not self.by_planes else _PyAVReader(self)
@@ -92,6 +98,7 @@ def probe_video(path: Path, is_mask: bool = False) -> VideoClip:
         undecodable=found.undecodable,
         by_opencv=not (found.interlaced or found.cut) and _opencv_agrees(path, found),
         planar=found.pixels in _PLANAR,
+        keys=found.keys,
     )
 
 
@@ -105,7 +112,7 @@ def as_calibrated(clip: Clip, size: tuple[int, int]) -> Clip:
 def notes_on(clips: Sequence[Clip]) -> list[str]:
     """Return lines about videos that the user should know of: interlaced ones, and ones that are not turned."""
     lines = []
-    videos = [clip for clip in clips if isinstance(clip, VideoClip)]
+    videos = _videos(clips)
     if marked := [clip for clip in videos if clip.interlaced]:
         lines.append(
             f"{marked[0].path}{f' and {len(marked) - 1} more' if marked[1:] else ''}: marked as interlaced; if moving "
@@ -122,26 +129,34 @@ def notes_on(clips: Sequence[Clip]) -> list[str]:
 
 def odd_turn(clip: Clip, clips: Sequence[Clip]) -> str:
     """Return in words by how much the file of a clip asks for a turn, if most of the other clips ask for another."""
-    turns = [each.turn for each in clips if isinstance(each, VideoClip)]
-    if not isinstance(clip, VideoClip) or 2 * turns.count(clip.turn) >= len(turns):
+    turns = [each.turn for each in _videos(clips)]
+    own = [each.turn for each in _videos([clip])]
+    if not own or 2 * turns.count(own[0]) >= len(turns):
         return ""
-    asks = f"asks players to turn its images by {clip.turn}°" if clip.turn else "asks for no turn of its images"
+    asks = f"asks players to turn its images by {own[0]}°" if own[0] else "asks for no turn of its images"
     return f"its file {asks}, unlike most of the others: the calibration may be of images without this turn"
 
 
-def damaged_images(clip: VideoClip, stop: int) -> list[int]:
-    """Return the images of a video before ``stop`` that FFmpeg cannot decode unless it repairs them, which it does
-    without an error, so that no reader notices."""
+def _videos(clips: Sequence[Clip]) -> list[VideoClip]:
+    return [part for clip in clips for part in clip.parts if isinstance(part, VideoClip)]
+
+
+def damaged_images(clip: VideoClip, stop: int, start: int = 0) -> list[int]:
+    """Return the images ``start`` to ``stop`` - 1 of a video that FFmpeg cannot decode unless it repairs them, which it
+    does without an error, so that no reader notices."""
     import av.error
 
     times: list[int] = []
     damaged: set[int] = set()
     container, stream = open_video(clip.path)
+    key = int(clip.keys[clip.keys <= start].max(initial=0))
     with container:
         stream.thread_type = "SLICE"  # threads of whole images report errors with later ones
         stream.codec_context.options = {"err_detect": "explode"}
+        if key and clip.times_s is not None:
+            container.seek(round(clip.times_s[key] / stream.time_base), stream=stream)
         packets = container.demux(stream)
-        while len(times) < clip.undecodable + stop + REORDERED:
+        while len(times) < (0 if key else clip.undecodable) + stop - key + REORDERED:
             try:
                 packet = next(packets)
             except (StopIteration, av.error.FFmpegError):  # in an error a reader fails, too
@@ -155,8 +170,13 @@ def damaged_images(clip: VideoClip, stop: int) -> list[int]:
                 packet.decode()
             except av.error.FFmpegError:
                 damaged.add(time)
-    shown = sorted(times)[clip.undecodable :][:stop]
-    return [i for i, time in enumerate(shown) if time in damaged]
+        tick = float(stream.time_base)
+    if key and clip.times_s is not None:
+        # images before the key refer to others that were not read
+        numbers = np.searchsorted(clip.times_s, tick * np.array(sorted(damaged)) - 0.5 * tick)
+        return numbers[(start <= numbers) & (numbers < stop)].tolist()
+    shown = sorted(times)[clip.undecodable :][start:stop]
+    return [i for i, time in enumerate(shown, start) if time in damaged]
 
 
 class _OpenCVReader:
@@ -167,10 +187,13 @@ class _OpenCVReader:
         self._whole: NDArray[Any] | None = None  # memory of the last recorded image
 
     def skip(self) -> None:
-        # no seeking: depending on codec and FFmpeg version it lands on key frames, or is off by one
         if not self._capture.grab():
             self._fail()
         self._index += 1
+
+    def jump(self, number: int) -> int:
+        # no seeking: depending on codec and FFmpeg version it lands on key frames, or is off by one
+        return self._index
 
     def read(self, out: Image) -> None:
         clip = self._clip
@@ -202,23 +225,77 @@ class _PyAVReader:
     def __init__(self, clip: VideoClip) -> None:
         self._clip = clip
         self._index = 0
-        self._container, stream = open_video(clip.path)
-        self._images = decoded(self._container.demux(stream))
+        self._container: Any = None
+        self._sought = False  # whether images are counted by their time stamps
+        self._begin()
         if clip.by_planes:
             # brightness, and below it the two colours, as COLOR_YUV2BGR_I420 expects them
             self._planes = np.empty((clip.height * 3 // 2, clip.width), np.uint8)
             colors = self._planes[clip.height :].reshape(2, clip.height // 2, clip.width // 2)
             self._small = (self._planes[: clip.height], *colors)
 
+    def _begin(self) -> None:
+        self.close()
+        self._container, self._stream = open_video(self._clip.path)
+        self._images = decoded(self._container.demux(self._stream))
+        self._waiting: Any = None  # an image that has been decoded before its turn
+
     def _next(self) -> Any:
         import av.error
 
         try:
-            image = next(self._images)
+            image = self._waiting or next(self._images)
+            while self._sought and (number := self._number(image)) < self._index:
+                image = next(self._images)
         except (av.error.FFmpegError, StopIteration):
             raise _undecodable(self._clip, self._index) from None
+        # an image that cannot be decoded is missing: the one after it is shown in its place
+        self._waiting = image if self._sought and number > self._index else None
         self._index += 1
         return image
+
+    def _number(self, image: Any) -> int:
+        """Return the number of a decoded image, by its time stamp; -1 without one."""
+        times = self._clip.times_s
+        if times is None or image.pts is None:
+            return -1
+        time = image.pts * float(self._stream.time_base)
+        after = int(np.clip(np.searchsorted(times, time), 1, max(len(times) - 1, 1)))
+        return after - 1 if len(times) < 2 or time - times[after - 1] < times[after] - time else after
+
+    def jump(self, number: int) -> int:
+        keys = self._clip.keys
+        keys = keys[(keys > self._index + REORDERED) & (keys <= number)]
+        for key in keys[: -_KEYS_TRIED - 1 : -1].tolist():
+            if self._begin_at(key):
+                self._index, self._sought = key, True
+                return key
+        if len(keys):  # the file cannot be read from the middle: from its start to where this reader was
+            self._begin()
+            if not self._sought:
+                for _ in range(self._index):
+                    next(self._images, None)
+        return self._index
+
+    def _begin_at(self, key: int) -> bool:
+        """Let decoding begin at a key image; return whether it is whole then."""
+        import av.error
+
+        times = self._clip.times_s
+        assert times is not None
+        # containers without an index are sought by decoding times, which are earlier than presentation times
+        start = max(key - REORDERED, 0) if self._container.format.name in _WITHOUT_INDEX else key
+        self._waiting = None
+        try:
+            self._container.seek(round(times[start] / self._stream.time_base), stream=self._stream)
+            self._images = decoded(self._container.demux(self._stream))
+            image = next(self._images)
+            while 0 <= self._number(image) < key:
+                image = next(self._images)
+        except (av.error.FFmpegError, StopIteration):
+            return False
+        self._waiting = image
+        return self._number(image) == key and not image.is_corrupt
 
     def skip(self) -> None:
         self._next()
@@ -242,7 +319,8 @@ class _PyAVReader:
         cv2.cvtColor(self._planes, cv2.COLOR_YUV2BGR_I420, dst=out)
 
     def close(self) -> None:
-        self._container.close()
+        if self._container is not None:
+            self._container.close()
 
 
 def _undecodable(clip: VideoClip, index: int) -> VideoError:

@@ -7,49 +7,69 @@ from pathlib import Path
 
 from tk.errors import CaptureError, ClockError
 from tk.io.captures.capture import Capture, open_capture
-from tk.io.importers import easymocap, opencap, panoptic, projections, qualisys, toml_tools, vicon
-from tk.io.importers.project import Format, Project, read_format
+from tk.io.captures.session import inherited, is_session
+from tk.io.importers import (
+    calibio,
+    colmap,
+    easymocap,
+    multical,
+    opencap,
+    opencv,
+    optitrack,
+    panoptic,
+    projections,
+    qualisys,
+    toml_tools,
+    vicon,
+)
+from tk.io.importers.project import Format, Project, Wanted, read_format
 from tk.io.importers.write import Imported, write_capture
+from tk.io.paths import referred_files
 
-__all__ = ["FORMATS", "Imported", "import_project", "read_project"]
+__all__ = ["FORMATS", "Imported", "Wanted", "import_project", "read_project"]
 
 #: in the order in which they are tried: formats with more specific file names first
 FORMATS = (
-    panoptic.FORMAT, easymocap.FORMAT, toml_tools.FREEMOCAP, toml_tools.CALISCOPE, toml_tools.POSE2SIM, qualisys.FORMAT,
-    vicon.FORMAT, toml_tools.ANIPOSE, opencap.FORMAT, projections.FORMAT,
+    multical.FORMAT, calibio.FORMAT, panoptic.FORMAT, easymocap.FORMAT,
+    toml_tools.FREEMOCAP, toml_tools.CALISCOPE, toml_tools.POSE2SIM, qualisys.FORMAT,
+    vicon.FORMAT, optitrack.FORMAT, colmap.FORMAT, toml_tools.ANIPOSE, opencap.FORMAT, opencv.FORMAT,
+    projections.FORMAT,
 )  # fmt: skip
 
+#: what a user wants who gives no options
+_ANYTHING = Wanted()
 #: folders above the given one that are searched for a calibration: SESSION/recordings/TRIAL
 _LEVELS_UP = 2
 #: files that a message about an unknown folder names; more would not fit into three lines
 _NAMED = 6
 
 
-def import_project(folder: Path, output: Path, unit: str | None = None, trial: str | None = None) -> Imported:
+def import_project(folder: Path, output: Path, wanted: Wanted = _ANYTHING) -> Imported:
     """Read the project in ``folder`` and write it as the capture ``output``.
 
     Args:
         folder: another tool's project, or a recording in it.
         output: path of the capture; it must not exist, or be empty.
-        unit: "m", "cm" or "mm", unit of the calibration's lengths; None to infer it.
-        trial: a part of the path of the videos, if there are several recordings.
+        wanted: what the user gives: units, trial, scale.
 
     Raises:
         CaptureError: or a subclass, with one line that names the file and what is wrong with it.
     """
-    return write_capture(read_project(folder, unit, trial), output)
+    return write_capture(read_project(folder, wanted), output)
 
 
-def read_project(folder: Path, unit: str | None = None, trial: str | None = None) -> Project:
+def read_project(folder: Path, wanted: Wanted = _ANYTHING) -> Project:
     """Read the project in a folder, of any tool; arguments as for :func:`import_project`."""
     if not folder.is_dir():
         raise CaptureError(f"{folder}: is not a folder; give the project folder of the tool that calibrated")
+    if is_session(folder):
+        raise CaptureError(f"{folder}: is a session of captures; nothing to import: tk batch {folder} -o FOLDER")
     if _is_capture(folder):
         raise CaptureError(f"{folder}: is a capture already; nothing to import: tk track {folder} -o RESULT.h5")
     found = _find(folder)
     if found is not None:
-        return read_format(*found, folder, unit, trial)
-    searched = ", ".join(form.patterns[0] for form in FORMATS)
+        return read_format(*found, folder, wanted)
+    searched = ", ".join(dict.fromkeys(form.patterns[0] for form in FORMATS))
     here = sorted(f"{path.name}/" if path.is_dir() else path.name for path in folder.iterdir())
     names = ", ".join(here[:_NAMED]) + (f" and {len(here) - _NAMED} more" if len(here) > _NAMED else "")
     raise CaptureError(
@@ -66,8 +86,8 @@ def open_recording(
     try:
         return open_capture(path, cameras, masks, resample)
     except CaptureError as error:
-        images = (path / "videos").is_dir() or (path / "images").is_dir()
-        if path.is_dir() and not (images and (path / "calibration.toml").exists()):
+        images = (path / "videos").is_dir() or (path / "images").is_dir() or bool(referred_files(path))
+        if path.is_dir() and not is_session(path) and not (images and inherited(path, "calibration.toml").exists()):
             found = _find(path)
             # calibration.toml is a capture's file, too; then the videos' folder decides
             own = ("videos", "images", ".")
@@ -96,7 +116,7 @@ def _find(folder: Path) -> tuple[Format, list[Path]] | None:
 
 def _is_capture(folder: Path) -> bool:
     """Return whether the folder can be tracked as it is."""
-    if not (folder / "calibration.toml").is_file():
+    if not inherited(folder, "calibration.toml").is_file():
         return False
     try:
         open_capture(folder)

@@ -10,7 +10,6 @@ The videos are in `videos/1.mp4`, or images in `images/1/000000.jpg`.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,7 +18,8 @@ from numpy.typing import NDArray
 
 from tk.errors import CalibrationError
 from tk.io.importers.project import Format, Tables
-from tk.io.toml import read_text
+from tk.io.importers.storage import numbers, read_storage
+from tk.io.toml import shown
 
 
 def _read(files: Sequence[Path]) -> Tables:
@@ -48,56 +48,41 @@ def _read(files: Sequence[Path]) -> Tables:
 
 
 class _OpenCvYaml:
-    """A YAML file as OpenCV writes it: at the top level matrices, numbers and a list of names.
-
-    OpenCV's own reader is not used: a damaged file can crash the process.
-    """
+    """A YAML file as OpenCV writes it: at the top level matrices, numbers and a list of names."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        text = read_text(path, CalibrationError)
-        blocks = re.findall(r"^([^\s:#%-][^:\n]*):(.*?)(?=^[^\s-]|\Z)", f"{text}\n", re.M | re.S)
-        self._blocks = {key.strip(): block.strip() for key, block in blocks}
-        if not self._blocks:
-            raise CalibrationError(f"{path}: is not YAML as OpenCV writes it: it has no keys")
+        self._values = read_storage(path)
 
     def names(self) -> list[str]:
         """Return the list `names`, which has one name per line or is in brackets."""
-        block = self._blocks.get("names")
-        if block is None:
+        listed = self._values.get("names")
+        if not isinstance(listed, list):
             raise CalibrationError(f"{self.path}: has no list `names` of its cameras")
-        inside = re.fullmatch(r"\[(.*)\]", block, re.S)
-        items = inside.group(1).split(",") if inside else re.findall(r"^\s*-(.*)$", block, re.M)
-        found = [item.strip().strip("\"'").strip() for item in items]
+        found = [str(item).strip() for item in listed]
         if not all(found) or len(set(found)) < len(found):
             raise CalibrationError(f"{self.path}: names must be distinct and not empty, but are {found}")
         return found
 
     def matrix(self, key: str, *counts: int) -> NDArray[np.float64] | None:
         """Return the numbers of a matrix, flat, as many as one of ``counts``; None without such a key."""
-        block = self._blocks.get(key)
-        if block is None:
+        if key not in self._values:
             return None
-        data = re.search(r"data:\s*\[(.*?)\]", block, re.S)
         try:
-            values = [float(word) for word in data.group(1).split(",")] if data else []
-        except ValueError:
-            values = []
+            values = np.array(numbers(self._values[key]), dtype=np.float64).ravel()
+        except (TypeError, ValueError):
+            values = np.zeros(0)
         if len(values) not in counts or not np.isfinite(values).all():
             raise CalibrationError(f"{self.path}: {key} must be a matrix of {counts[0]} finite numbers")
-        return np.array(values)
+        return values
 
     def pixels(self, key: str) -> int:
         """Return a whole number from 1; 0 without such a key."""
-        block = self._blocks.get(key)
-        if block is None:
+        if key not in self._values:
             return 0
-        try:
-            value = float(block)
-        except ValueError:
-            value = 0.0
-        if not 1 <= value < 1e6:
-            raise CalibrationError(f"{self.path}: {key} = {block[:40]!r} must be a number of pixels")
+        value = numbers(self._values[key])
+        if not isinstance(value, float) or not 1 <= value < 1e6:
+            raise CalibrationError(f"{self.path}: {key} = {shown(self._values[key])} must be a number of pixels")
         return round(value)
 
 

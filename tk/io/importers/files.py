@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 from tk.errors import CalibrationError
-from tk.io.toml import Table, read_text
+from tk.io.toml import MOST_BYTES, Table, read_text
 
 
 def read_xml(path: Path) -> Element:
@@ -24,6 +26,29 @@ def read_xml(path: Path) -> Element:
         return ElementTree.fromstring(text)
     except ElementTree.ParseError as reason:
         raise CalibrationError(f"{path}: invalid XML: {reason}") from None
+
+
+def read_json(path: Path) -> Mapping[str, Any]:
+    """Return the object in a JSON file."""
+    text = read_text(path, CalibrationError)
+    try:
+        document = json.loads(text)
+    except (ValueError, RecursionError) as reason:  # ValueError: also a number of thousands of digits
+        raise CalibrationError(f"{path}: invalid JSON: {reason}") from None
+    if not isinstance(document, Mapping):
+        raise CalibrationError(f"{path}: must hold one JSON object {{…}}")
+    return document
+
+
+def contains(path: Path, *words: bytes) -> bool:
+    """Return whether a small file contains all of these words."""
+    try:
+        if not path.is_file() or path.stat().st_size > MOST_BYTES:  # a pipe never ends
+            return False
+        content = path.read_bytes()
+    except OSError:
+        return False
+    return all(word in content for word in words)
 
 
 def attributes(element: Element, where: str, words: Mapping[str, slice] = MappingProxyType({})) -> Table:

@@ -8,25 +8,20 @@ Lengths are centimetres; R and t map world to camera; the world's y axis points 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from tk.errors import CalibrationError
-from tk.io.importers.files import only
+from tk.io.importers.files import only, read_json
 from tk.io.importers.project import Format, Tables
-from tk.io.toml import Table, read_text
+from tk.io.toml import Table
 
 
 def _read(files: Sequence[Path]) -> Tables:
     path = only(files)
-    try:
-        document = json.loads(read_text(path, CalibrationError))
-    except (json.JSONDecodeError, RecursionError) as reason:
-        raise CalibrationError(f"{path}: invalid JSON: {reason}") from None
-    listed = document.get("cameras") if isinstance(document, Mapping) else None
+    listed = read_json(path).get("cameras")
     if not isinstance(listed, list) or not all(isinstance(item, Mapping) for item in listed):
         raise CalibrationError(f"{path}: has no list of `cameras`")
     found = Tables(path, unit="cm", unit_from="the format")

@@ -52,6 +52,7 @@ class Tables:
         markers: cameras that may record no videos. unusable: number of such cameras that are not calibrated.
         notes: as in :class:`Project`.
         unit: unit of lengths, None if unknown; unit_from: what specifies it.
+        scaled: whether the unit is one of length; otherwise it is arbitrary, and the user must give it.
     """
 
     def __init__(self, source: Path, unit: str | None = None, unit_from: str = "the file") -> None:
@@ -59,6 +60,7 @@ class Tables:
         self.cameras: dict[str, Mapping[str, Any]] = {}
         self.markers: set[str] = set()
         self.unusable = 0
+        self.scaled = True
         self.notes: list[str] = []
 
     def add(
@@ -71,6 +73,7 @@ class Tables:
         translation: ArrayLike,
         key: str = "",
         turns: int = 0,
+        fisheye: bool = False,
     ) -> None:
         """Add a camera.
 
@@ -83,11 +86,12 @@ class Tables:
             translation: (3,) world to camera.
             key: its second name.
             turns: clockwise quarter turns after which its image is upright.
+            fisheye: whether the distortions are those of OpenCV's fisheye model.
         """
         arrays = {"size": size, "matrix": matrix, "distortions": distortions}
         arrays |= {"rotation": rotation, "translation": translation}
         values = {name: np.asarray(array).tolist() for name, array in arrays.items()}
-        table = {"name": name, "rotation_count": turns, **values}
+        table = {"name": name, "rotation_count": turns, "fisheye": fisheye, **values}
         self.cameras[key if key and key not in self.cameras else name] = table
 
     @contextmanager
@@ -140,7 +144,22 @@ class Format:
         return next((files for files in found if files), [])
 
 
-def read_format(form: Format, files: Sequence[Path], folder: Path, unit: str | None, trial: str | None) -> Project:
+@dataclass(frozen=True)
+class Wanted:
+    """What the user asks of an import.
+
+    Attributes:
+        unit: "m", "cm" or "mm", unit of the calibration's lengths; None to infer it.
+        trial: a part of the path of the videos, if there are several recordings.
+        scale: length of the calibration's unit, "0.83" (metres), or a measured distance, "cam1,cam2=3.42" (metres).
+    """
+
+    unit: str | None = None
+    trial: str | None = None
+    scale: str | None = None
+
+
+def read_format(form: Format, files: Sequence[Path], folder: Path, wanted: Wanted) -> Project:
     """Read the calibration ``files``, and find a video in ``folder`` for every camera."""
     tables = form.read(files)
     if len(tables.cameras) < 2:
@@ -149,10 +168,10 @@ def read_format(form: Format, files: Sequence[Path], folder: Path, unit: str | N
             f"{tables.source}: {len(tables.cameras)} calibrated camera, and a capture needs at least 2{why}"
         )
     calibration = calibration_of(tables.source, tables.cameras, "m", sizes_known=False)
-    rig, unit_note = _in_metres(calibration.rig, tables, unit, form.unit)
+    rig, unit_note = _in_metres(calibration.rig, tables, wanted, form.unit)
     names = [CameraNames(camera.name, key) for camera, key in zip(rig, calibration.keys, strict=True)]
     marker = [camera.name in tables.markers for camera in rig]
-    found = _find_clips(form, folder, names, marker, trial)
+    found = _find_clips(form, folder, names, marker, wanted.trial)
     chosen = [index for index, clip in enumerate(found.clips) if clip is not None]
     notes = [*tables.notes, f"{tables.source}: {unit_note}", *found.notes]
     without = [index for index, clip in enumerate(found.clips) if clip is None]
@@ -208,10 +227,19 @@ def _fractional(size: Any) -> tuple[float, float] | None:
     return width, height
 
 
-def _in_metres(rig: Rig, tables: Tables, requested: str | None, default: str) -> tuple[Rig, str]:
+def _in_metres(rig: Rig, tables: Tables, wanted: Wanted, default: str) -> tuple[Rig, str]:
     """Return the cameras with lengths in metres, and a note about the unit: requested, specified, or inferred."""
-    if requested:
-        found, reason = FoundUnit(requested), "as requested"
+    if wanted.scale:
+        return _scaled(rig, tables.source, wanted.scale)
+    if wanted.unit:
+        found, reason = FoundUnit(wanted.unit), "as requested"
+    elif not tables.scaled:
+        a, b = rig.names[:2]
+        raise CalibrationError(
+            f"{tables.source}: the length of its unit is arbitrary; measure the distance of two cameras, from lens to "
+            "lens, and give it",
+            hint=f"--scale {a},{b}=METRES, or --units m if the model was scaled to metres",
+        )
     elif tables.unit:
         found, reason = FoundUnit(tables.unit), f"as {tables.unit_from} says"
     else:
@@ -225,6 +253,29 @@ def _in_metres(rig: Rig, tables: Tables, requested: str | None, default: str) ->
     if not LEAST_APART_M <= apart(rig.centers) <= MOST_APART_M:
         note += f": the cameras are then up to {apart(rig.centers):.3g} m apart, which is unlikely"
     return rig, note
+
+
+def _scaled(rig: Rig, source: Path, scale: str) -> tuple[Rig, str]:
+    """Return the cameras with lengths in metres by a scale that the user gives, and a note about it."""
+    names, _, length = scale.rpartition("=")
+    try:
+        metres = float(length)
+    except ValueError:
+        metres = 0.0
+    if not 0 < metres < float("inf"):
+        raise CalibrationError(
+            f"scale {scale!r}: must be metres in one unit of the calibration, or cam1,cam2=METRES, a measured distance"
+        )
+    if names:
+        pair = [name.strip() for name in names.split(",")]
+        if len(pair) != 2 or pair[0] == pair[1] or any(name not in rig.names for name in pair):
+            raise CalibrationError(f"scale {scale!r}: must name two cameras of {source}: {', '.join(rig.names)}")
+        a, b = (rig[rig.names.index(name)].center for name in pair)
+        if not (between := float(np.linalg.norm(a - b))) > 0:
+            raise CalibrationError(f"scale {scale!r}: both cameras stand in the same place in {source}")
+        metres /= between
+    rig = scale_world(rig, metres)
+    return rig, f"one unit is {metres:.6g} m, as requested: the cameras are up to {apart(rig.centers):.3g} m apart"
 
 
 def _by_person(rig: Rig, source: Path) -> FoundUnit:

@@ -3,7 +3,8 @@
 Focal lengths and principal point are in 1/64 pixel of the whole sensor; `fov_video` is the part of the sensor that a
 video shows. Without it, as in Theia's files, videos show the whole sensor, whose unit is then that of its extent.
 Lengths are millimetres: `x y z` is the camera centre; r11 … r33 map world to a camera frame with x right, y up and z
-backwards, which is converted to OpenCV's. The distortion coefficients are OpenCV's: Pose2Sim divides them by 64, but
+backwards, which is converted to OpenCV's. Theia's description has a translation instead of the centre, and its axes are
+only in a picture: the cameras decide. The distortion coefficients are OpenCV's: Pose2Sim divides them by 64, but
 OpenCV's own calibration of the same cameras, in Pose2Sim's demo, has the undivided values.
 
 A file also lists marker cameras. Their models do not say for sure which cameras record videos (Oqus and Miqus Hybrid
@@ -16,11 +17,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
-import numpy as np
-
 from tk.errors import CalibrationError
 from tk.io.importers.files import child, matching, only, read_xml
 from tk.io.importers.project import Format, Tables
+from tk.io.importers.readings import choose, placed, to_camera, y_up
 
 #: QTM's units per pixel
 _SUBPIXELS = 64.0
@@ -31,8 +31,13 @@ _LEAST_SUBPIXELS = 12_800
 #: bytes of a file in which its first camera is named
 _HEAD_BYTES = 4096
 
-#: camera frame of QTM (x right, y up, z backwards) to OpenCV's
-_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
+#: ways to read <transform>, QTM's first
+_READINGS = {
+    "x y z is a camera's centre, its y axis points up": y_up(placed),
+    "x y z is a translation, the camera's y axis points up": y_up(to_camera),
+    "x y z is a camera's centre, its y axis points down": placed,
+    "x y z is a translation, the camera's y axis points down": to_camera,
+}
 
 _DISTORTIONS = (
     "radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2", "radialDistortion3"
@@ -58,6 +63,7 @@ def read_tables(files: Sequence[Path]) -> Tables:
             _add(found, item, name, turns if turns == 2 else 0)  # it is unknown to which side QTM turns the others
             if turns:
                 turned.append(name)
+    choose(found, _READINGS)
     turned = [name for name in turned if name not in found.markers]
     if any(item.find("fov_video") is None and item.find("fov_video_max") is None for item in active):
         found.notes.append(f"{path}: has no fov_video: the videos are taken to show the whole sensor")
@@ -85,14 +91,14 @@ def _add(found: Tables, item: Element, name: str, turns: int) -> None:
     fx, fy, cx, cy = (
         intrinsic.number(key) / unit for key in ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV")
     )
-    rotation = _TO_OPENCV @ [[transform.number(f"r{row}{column}") for column in "123"] for row in "123"]
+    rotation = [[transform.number(f"r{row}{column}") for column in "123"] for row in "123"]
     found.add(
         name,
         size=[round(right - left + 1), round(bottom - top + 1)],
         matrix=[[fx, intrinsic.number("skew", 0.0) / unit, cx - left], [0.0, fy, cy - top], [0.0, 0.0, 1.0]],
         distortions=[intrinsic.number(key, 0.0) for key in _DISTORTIONS],
         rotation=rotation,
-        translation=-rotation @ [transform.number(key) for key in "xyz"],
+        translation=[transform.number(key) for key in "xyz"],
         turns=turns,
     )
 

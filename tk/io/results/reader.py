@@ -65,15 +65,20 @@ def read_people(path: str | os.PathLike[str]) -> tuple[JointTrack, ...]:
     Raises:
         ResultError: as :func:`read_result`, or a joint is missing, a frame is repeated, or the unit is not metres.
     """
-    path = Path(path)
-    with open_hdf5(path) as file:
+    with open_hdf5(Path(path)) as file:
         if file.attribute("", "format") is None:
-            units = file.text("", "units", "m")
-            if units != "m":
-                file.fail(f"units = {units}; joint positions must be in metres (m)")
-            prefixes = [f"people/{person}/" for person in range(_count_people(file))] if "people" in file else [""]
-            return tuple(_read_truth(file, prefix) for prefix in prefixes)
+            return _read_truths(file)
     return joint_tracks(read_result(path))
+
+
+def read_truth(path: str | os.PathLike[str]) -> tuple[JointTrack, ...]:
+    """Read the joints of each person of ground truth; see :func:`read_people`. A result of an older version, too, is
+    ground truth: joints have the same place in every version."""
+    with open_hdf5(Path(path)) as file:
+        version = file.attribute("", "format_version")
+        if file.is_format(FORMAT) and isinstance(version, int | np.integer) and version < FORMAT_VERSION:
+            return _read_truths(file)
+    return read_people(path)
 
 
 def read_joints(path: str | os.PathLike[str]) -> JointTrack:
@@ -89,7 +94,7 @@ def joint_tracks(result: Result) -> tuple[JointTrack, ...]:
 def truth_of(result: Result, path: Path) -> Float | None:
     """Return the ground-truth joints (P, F, J, 3) of each person in the result's frames, NaN if missing; None without
     the file."""
-    return positions_at(result.frames, read_people(path)) if path.exists() else None
+    return positions_at(result.frames, read_truth(path)) if path.exists() else None
 
 
 def positions_at(frames: NDArray[np.int64], people: Sequence[JointTrack]) -> Float:
@@ -273,6 +278,15 @@ def _count_people(file: Hdf5Reader) -> int:
 
 def _read(file: Hdf5Reader, path: str, entry: Dataset, shape: tuple[int | None, ...]) -> NDArray[Any]:
     return file.array(path, entry.dtype, shape, *entry.valid, entry.finite)
+
+
+def _read_truths(file: Hdf5Reader) -> tuple[JointTrack, ...]:
+    """Return the joints of each person in a file of ground truth."""
+    units = file.text("", "units", "m")
+    if units != "m":
+        file.fail(f"units = {units}; joint positions must be in metres (m)")
+    prefixes = [f"people/{person}/" for person in range(_count_people(file))] if "people" in file else [""]
+    return tuple(_read_truth(file, prefix) for prefix in prefixes)
 
 
 def _read_truth(file: Hdf5Reader, prefix: str) -> JointTrack:

@@ -1,29 +1,32 @@
 """Compares the landmarks of several images: to whom they belong, and whether they confirm a camera.
 
-The landmarks of the other cameras are triangulated, by consensus. If a camera is right and its landmarks show the same
-person, they lie at the projections of these points, up to the network's errors; else they lie anywhere on a person. The
-logarithm of the ratio of both likelihoods is the evidence. Wrong masks do not make the joints of a person agree in all
-images.
+The landmarks of the other cameras that agree are triangulated. If a camera is right and its landmarks show the same
+person, they lie at the projections of these points, up to the network's errors and what these leave open of the points;
+else they lie anywhere on a person. The logarithm of the ratio of both likelihoods is the evidence. Wrong masks do not
+make the joints of a person agree in all images.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.cameras.camera import Camera, Rig
-from tk.model.cameras.triangulation import triangulate_joints
-from tk.model.cues.landmarks import log_ratio
+from tk.model.cameras.camera import Rig
+from tk.model.cues.landmarks import deviation, log_ratio, right_share
 
 Float = NDArray[np.float64]
+
+#: how far a point may be from where the landmarks leave it open, metres: a person's size
+REACH_M = 1.0
 
 
 def evidence_for_cameras(rig: Rig, landmarks: Sequence[Float]) -> Float:
     """Return (C,) the logarithm of the likelihood ratio, nats, of each camera being right against being wrong; NaN
-    without landmarks of one person in it and in two others.
+    without landmarks of one person in it, and in two others that agree.
 
     Frames of an opening err alike, so they count as one: the mean over the frames is returned.
 
@@ -33,7 +36,10 @@ def evidence_for_cameras(rig: Rig, landmarks: Sequence[Float]) -> Float:
     """
     total, count = np.zeros(len(rig)), np.zeros(len(rig))
     for people in landmarks:
-        found = np.array([[_fit(rig, seen, c, seen[c]) for c in range(len(rig))] for seen in people])
+        own = [_Pairs.of(_Sets.of(rig, seen)) for seen in people]
+        found = np.array(
+            [[pairs.fit_without(c, pairs.sets.of_cameras([c]))[0] for c in range(len(rig))] for pairs in own]
+        )
         known = np.isfinite(found)
         total += np.where(known, found, 0.0).sum(axis=0)
         count += known.any(axis=0)
@@ -44,11 +50,13 @@ def associated(rig: Rig, landmarks: Float) -> Float:
     """Return landmarks (N, C, L, 3) of N people with each image's sets of landmarks given to the people whom they show.
 
     A network that is asked for a person behind another one may show the one in front. A set that fits nobody is
-    dropped. A person whom fewer than two other images show keeps the set, because it cannot be tested.
+    dropped. A person on whom no two other images agree keeps the set, because it cannot be tested.
     """
     result = landmarks.copy()
-    for c in range(len(rig)):
-        fit = np.array([[_fit(rig, seen, c, other[c]) for other in landmarks] for seen in landmarks])
+    people = [_Pairs.of(_Sets.of(rig, seen)) for seen in landmarks]
+    for c, camera in enumerate(rig):
+        shown = _Sets.of(Rig((camera,) * len(people)), landmarks[:, c]) if people else None
+        fit = np.array([pairs.fit_without(c, shown) for pairs in people if shown is not None])
         fit = fit.reshape(len(landmarks), len(landmarks))
         free = np.ones(len(landmarks), np.bool_)
         open_to = np.isfinite(fit)
@@ -61,43 +69,129 @@ def associated(rig: Rig, landmarks: Float) -> Float:
     return result
 
 
-def consensus(rig: Rig, seen: Float) -> tuple[NDArray[np.bool_], Float]:
-    """Return (C,) the cameras whose landmarks, of (C, L, 3), show one person, and that person's points (L, 3), metres.
+class Consensus(NamedTuple):
+    """What most cameras show of one person: (C,) cameras that agree, the person's points (L, 3), metres, NaN if
+    unknown, and the sum of the cameras' logarithms of likelihood ratios, nats."""
+
+    agree: NDArray[np.bool_]
+    points: Float
+    support: float
+
+
+def consensus(rig: Rig, seen: Float) -> Consensus:
+    """Return the cameras whose landmarks, of (C, L, 3), show one person.
 
     Each pair of cameras proposes points; those with the highest likelihood in all cameras are the person's, so people
     who stand close together are separated. Without a pair that agrees, no camera is returned.
     """
-    C, L = seen.shape[:2]
-    known = np.flatnonzero(np.isfinite(seen[..., 0]).any(axis=1))
-    best, agree, found = 0.0, np.zeros(C, np.bool_), np.full((L, 3), np.nan)
-    for a, b in combinations(known.tolist(), 2):
-        pair = np.full(seen.shape, np.nan)
-        pair[[a, b]] = seen[[a, b]]
-        points, _ = triangulate_joints(rig, pair)
-        fit = np.array([_fit_of_points(rig[c], seen[c], points) if c in known else np.nan for c in range(C)])
-        support = np.where(fit > 0, fit, 0.0).sum()
-        if fit[a] > 0 and fit[b] > 0 and support > best:
-            best, agree, found = support, fit > 0, points
-    return agree, found
+    return _Pairs.of(_Sets.of(rig, seen)).consensus()
 
 
-def _fit(rig: Rig, seen: Float, c: int, own: Float) -> float:
-    """Return the logarithm of the likelihood ratio of landmarks (L, 3) in camera c showing the person whose landmarks
-    (C, L, 3) the others see; NaN if fewer than two others see them."""
-    others = seen.copy()
-    others[c] = np.nan
-    known = np.isfinite(own).all(axis=1)
-    if np.count_nonzero(np.isfinite(others[..., 0]).any(axis=1)) < 2 or not known.any():
-        return np.nan
-    return _fit_of_points(rig[c], own, triangulate_joints(rig, others)[0])
+class _Sets(NamedTuple):
+    """S sets of landmarks, each in an image of its own camera."""
+
+    rotation: Float  # (S, 3, 3) world to camera
+    translation: Float  # (S, 3)
+    known: NDArray[np.bool_]  # (S, L)
+    at: Float  # (S, L, 2) on the plane at distance 1, 0 if unknown
+    visibility: Float  # (S, L) 0 if unknown
+    information: Float  # (S, L, 3, 3) about the point, across its ray, 1/m²; 0 if unknown
+    pull: Float  # (S, L, 3) the same times the camera's centre, 1/m
+
+    @staticmethod
+    def of(rig: Rig, seen: Float) -> _Sets:
+        """Return the sets (S, L, 3) of S cameras, pixels and visibility; NaN if unknown."""
+        known = np.asarray(np.isfinite(seen).all(axis=-1))
+        at, rays = np.zeros((*known.shape, 2)), np.zeros((*known.shape, 3))
+        for k, camera in enumerate(rig):
+            at[k, known[k]] = camera.undistort(seen[k, known[k], :2])
+            rays[k, known[k]] = camera.rays(seen[k, known[k], :2])
+        visibility = np.where(known, seen[..., 2], 0.0)
+        weight = np.where(known, deviation(visibility) ** -2, 0.0)[..., None, None]
+        information = weight * (np.eye(3) - rays[..., :, None] * rays[..., None, :])
+        pull = (information @ rig.centers[:, None, :, None])[..., 0]
+        rotation, translation = np.array([c.rotation for c in rig]), np.array([c.translation for c in rig])
+        return _Sets(rotation, translation, known, at, visibility, information, pull)
+
+    def of_cameras(self, cameras: Sequence[int] | NDArray[np.int64]) -> _Sets:
+        """Return some of the sets."""
+        return _Sets(*(values[np.asarray(cameras)] for values in self))
+
+    def showing(self, points: _Points) -> Float:
+        """Return the logarithms of the likelihood ratios of the sets showing points, nats; NaN if no point is known.
+
+        Points (..., L, 3) and sets are broadcast against each other.
+        """
+        p_camera = np.einsum("...ij,...lj->...li", self.rotation, points.at) + self.translation[..., None, :]
+        depth = p_camera[..., 2]
+        known = self.known & np.isfinite(depth)
+        away = np.where((known & (depth > 0))[..., None], self.at * depth[..., None] - p_camera[..., :2], np.inf)
+        # rows of the derivative of the position across the camera's axis by the point
+        P = self.rotation[..., None, :2, :] - self.at[..., :, None] * self.rotation[..., None, 2:, :]
+        spread = P @ points.covariance @ P.swapaxes(-1, -2)
+        ratio = log_ratio(away, np.broadcast_to(self.visibility, known.shape), spread, points.right)
+        return np.where(known.any(axis=-1), np.where(known, ratio, 0.0).sum(axis=-1), np.nan)
 
 
-def _fit_of_points(camera: Camera, own: Float, points: Float) -> float:
-    """Return the logarithm of the likelihood ratio of landmarks (L, 3) in a camera showing points (L, 3), nats; NaN if
-    no point is known."""
-    known = np.isfinite(own).all(axis=1) & np.isfinite(points).all(axis=1)
-    if not known.any():
-        return np.nan
-    pixels, depth = camera.project(points[known])
-    away = (own[known, :2] - pixels) * (depth / np.sqrt(np.linalg.det(camera.matrix[:2, :2])))[:, None]
-    return log_ratio(np.linalg.norm(away, axis=1), own[known, 2])
+class _Points(NamedTuple):
+    """Points of a person by the landmarks of some cameras: (..., L, 3), metres, NaN if unknown, (..., L, 3, 3)
+    covariance, and (..., L) the probability that all these landmarks are right."""
+
+    at: Float
+    covariance: Float
+    right: Float
+
+    @staticmethod
+    def of(sets: _Sets, near: Float | None = None) -> _Points:
+        """Triangulate sets (..., S) by least squares. What they leave open, such as the depth between two cameras that
+        face each other, lies within :data:`REACH_M` of ``near`` (..., L, 3); None: of the solution."""
+        information, pull = sets.information.sum(axis=-4), sets.pull.sum(axis=-3)
+        number = np.count_nonzero(sets.known, axis=-2)
+        right = np.where(sets.known, right_share(sets.visibility), 1.0).prod(axis=-2)
+        if near is None:
+            near = np.where((number > 1)[..., None], (np.linalg.pinv(information) @ pull[..., None])[..., 0], np.nan)
+        covariance = np.asarray(np.linalg.inv(information + np.eye(3) / REACH_M**2))
+        at = (covariance @ (pull + near / REACH_M**2)[..., None])[..., 0]
+        return _Points(np.where((number > 0)[..., None], at, np.nan), covariance, right)
+
+
+class _Pairs(NamedTuple):
+    """What each pair of cameras shows of one person."""
+
+    sets: _Sets  # of the C cameras
+    pairs: NDArray[np.int64]  # (P, 2) cameras
+    points: Float  # (P, L, 3) metres
+    fit: Float  # (P, C) logarithm of each camera's likelihood ratio, nats; NaN without landmarks
+
+    @staticmethod
+    def of(sets: _Sets) -> _Pairs:
+        """Compare all pairs of the cameras that have landmarks."""
+        pairs = np.array(list(combinations(np.flatnonzero(sets.known.any(axis=1)).tolist(), 2)), np.int64).reshape(
+            -1, 2
+        )
+        both = _Points.of(sets.of_cameras(pairs))
+        beside = _Points(both.at[:, None], both.covariance[:, None], both.right[:, None])
+        fit = sets.showing(beside)
+        for own, other in (pairs.T, pairs.T[::-1]):  # each of a pair is compared with the other alone
+            alone = _Points.of(sets.of_cameras(other[:, None]), both.at)
+            fit[np.arange(len(pairs)), own] = sets.of_cameras(own).showing(alone)
+        return _Pairs(sets, pairs, both.at, fit)
+
+    def consensus(self, but: int = -1) -> Consensus:
+        """Return what most cameras show, those of camera ``but`` left out."""
+        C, L = self.sets.known.shape
+        fit = np.where((np.arange(C) == but) | np.isnan(self.fit), 0.0, self.fit)
+        support = np.maximum(fit, 0.0).sum(axis=1)
+        support[(np.take_along_axis(fit, self.pairs, axis=1) <= 0).any(axis=1)] = 0.0
+        if not (support > 0).any():
+            return Consensus(np.zeros(C, np.bool_), np.full((L, 3), np.nan), 0.0)
+        best = int(np.argmax(support))
+        return Consensus(fit[best] > 0, self.points[best], float(support[best]))
+
+    def fit_without(self, but: int, shown: _Sets) -> Float:
+        """Return (N,) the logarithm of the likelihood ratio of each of N sets in camera ``but`` showing the person whom
+        the others see; NaN if no two others agree, or a set is empty."""
+        agree = self.consensus(but).agree
+        if not agree.any():
+            return np.full(len(shown.known), np.nan)
+        return shown.showing(_Points.of(self.sets.of_cameras(np.flatnonzero(agree))))

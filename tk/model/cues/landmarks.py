@@ -104,7 +104,7 @@ class LandmarkCue:
         known = np.asarray(np.isfinite(seen).all(axis=-1))
         visibility = np.where(known, seen[..., 2], 0.0)
         self._sigma = SEEN_M * size * HIDDEN ** (1.0 - visibility)  # (..., V, L)
-        self._right = np.where(known, RIGHT_HIDDEN + (RIGHT_SEEN - RIGHT_HIDDEN) * visibility, 0.0)
+        self._right = np.where(known, right_share(visibility), 0.0)
         self._at = np.where(known[..., None], seen[..., :2], 0.0)
         # what is hidden in the images is guessed in all of them alike
         images = np.maximum(np.count_nonzero(known, axis=-2), 1)
@@ -182,13 +182,34 @@ class LandmarkCue:
         return np.log(both / WRONG_DENSITY), inside / both, r, np.broadcast_to(sigma, both.shape)
 
 
-def log_ratio(distance_m: Float, visibility: Float) -> float:
-    """Return the logarithm of the likelihood of landmarks (N,) at distances from where they should be, against that of
-    wrong ones, nats."""
-    sigma = np.hypot(SEEN_M, OFFSET_M) * HIDDEN ** (1.0 - visibility)
-    right = RIGHT_HIDDEN + (RIGHT_SEEN - RIGHT_HIDDEN) * visibility
-    inside = right / (2 * np.pi * sigma**2) * np.exp(-0.5 * (distance_m / sigma) ** 2)
-    return float(INDEPENDENT * np.log(inside / WRONG_DENSITY + 1.0 - right).sum())
+def deviation(visibility: Float) -> Float:
+    """Return the standard deviation of landmarks about the body's points, metres, by their visibility."""
+    return np.asarray(np.hypot(SEEN_M, OFFSET_M) * HIDDEN ** (1.0 - visibility))
+
+
+def right_share(visibility: Float) -> Float:
+    """Return the probability that landmarks are right, by their visibility."""
+    return np.asarray(RIGHT_HIDDEN + (RIGHT_SEEN - RIGHT_HIDDEN) * visibility)
+
+
+def log_ratio(away_m: Float, visibility: Float, spread: Float | None = None, known: Float | None = None) -> Float:
+    """Return (...) the logarithm of the likelihood of each landmark being right, against being wrong, nats.
+
+    Args:
+        away_m: (..., 2) metres from where it should be, across the view.
+        visibility: (...).
+        spread: (..., 2, 2) covariance of where it should be; None: it is known. What is open to a right landmark is
+            open to a wrong one, too, so an unknown place gives a ratio near 0.
+        known: (...) probability that this place is right; None: 1.
+    """
+    right = right_share(visibility) * (1.0 if known is None else known)
+    covariance = deviation(visibility)[..., None, None] ** 2 * np.eye(2) + (0.0 if spread is None else spread)
+    finite = np.asarray(np.isfinite(away_m).all(axis=-1))
+    away = np.where(finite[..., None], away_m, 0.0)
+    square = np.where(finite, (away * np.linalg.solve(covariance, away[..., None])[..., 0]).sum(axis=-1), np.inf)
+    wide = covariance + np.eye(2) / (2 * np.pi * WRONG_DENSITY)
+    ratio = np.sqrt(np.linalg.det(wide) / np.linalg.det(covariance)) * np.exp(-0.5 * square)
+    return np.asarray(INDEPENDENT * np.log(right * ratio + 1.0 - right))
 
 
 def _normalised(rig: Rig, landmarks: Float) -> Float:
@@ -216,7 +237,7 @@ def contradiction(rig: Rig, body: ConeBody, pose: Float, seen: Float) -> Float:
     expected = 3 * (np.hypot(OFFSET_M, SEEN_M) * size * HIDDEN ** (1.0 - visibility)) ** 2
     place = places(body.dimensions) @ body.skeleton.T_world_body.T
     square = ((body.skeleton.points(pose, SEGMENT, place) - points) ** 2).sum(axis=-1)
-    right = RIGHT_HIDDEN + (RIGHT_SEEN - RIGHT_HIDDEN) * visibility
+    right = right_share(visibility)
     excess = np.where(np.isfinite(square), right * np.maximum(square - expected, 0.0) / 6, 0.0)
     by_name = dict(zip(LANDMARKS, excess.tolist(), strict=True))
 

@@ -191,7 +191,7 @@ class MaskAgreement:
             wrong, right = [], list(range(C))
         if swapped:  # the other cameras may suffice, but the remedy is known
             a, b = (self.rig.names[c] for c in swapped)
-            refusal = f"the videos of {a} and {b} look swapped: with them exchanged all cameras agree"
+            refusal = f"the videos of {a} and {b} look swapped: exchange their names, and all cameras agree"
         elif refused:
             refusal = self._contradiction(frames, pairs, tested or right)
         else:

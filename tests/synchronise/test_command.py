@@ -1,0 +1,192 @@
+"""`tk sync` on small RAW folders, whole and with faults."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+import tomli_w
+from click.testing import CliRunner, Result
+from numpy.typing import NDArray
+
+from tests.synchronise.scenes import ring, wander, watch
+from tests.synchronise.test_sound import steps
+from tk.cli import main
+from tk.io.captures.calibration import camera_table
+from tk.io.toml import load_toml
+from tk.synchronise.looks import Look
+from tk.synchronise.sound import RATE
+
+NAMES = ("a", "b", "c")
+STARTS = (0.0, 2.2, 1.0)
+LENGTH_S = 12.0
+
+
+def write(path: Path, look: Look, sound: NDArray[np.float64] | None = None, timecode: str | None = None) -> None:
+    """Write images and sound as a video."""
+    with av.open(str(path), "w") as container:
+        video = container.add_stream("libx264", rate=30, options={"preset": "ultrafast", "crf": "20"})
+        video.height, video.width, video.pix_fmt = (*look.greys.shape[1:], "yuv420p")
+        video.codec_context.time_base = video.time_base = Fraction(1, 90000)
+        if timecode:
+            video.metadata["timecode"] = timecode
+        audio = None if sound is None else container.add_stream("aac", rate=RATE, layout="mono")
+        for time, grey in zip(look.times_s, look.greys, strict=True):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(grey), "gray")
+            frame.pts, frame.time_base = round(time * 90000), Fraction(1, 90000)
+            container.mux(video.encode(frame))
+        container.mux(video.encode())
+        if audio is not None and sound is not None:
+            part = av.AudioFrame.from_ndarray(sound[None].astype(np.float32), "fltp", "mono")
+            part.sample_rate, part.pts = RATE, 0
+            container.mux(audio.encode(part))
+            container.mux(audio.encode())
+
+
+def seen(c: int, start_s: float = 0.0, length_s: float = LENGTH_S) -> Look:
+    return watch(ring(3)[c], [wander(0), wander(1)], STARTS[c] + start_s, length_s, (25.0, 25.0, 20.0)[c], seed=c)
+
+
+def heard(c: int, sound: NDArray[np.float64]) -> NDArray[np.float64]:
+    noise = 0.01 * np.random.default_rng(c).standard_normal(round(LENGTH_S * RATE))
+    first = round(STARTS[c] * RATE)
+    return np.clip(0.3 * sound[first : first + len(noise)] + noise, -1, 1)
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A RAW folder with sound; b's video shows what it should only together with the calibration."""
+    folder = tmp_path_factory.mktemp("raw") / "RAW"
+    folder.mkdir()
+    sound = steps(0, LENGTH_S + 4)
+    for c, name in enumerate(NAMES):
+        write(folder / f"{name}.mp4", seen(c), heard(c, sound))
+    return folder
+
+
+@pytest.fixture
+def copy(raw: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(raw, tmp_path / "RAW"))
+
+
+def calibrate(folder: Path) -> None:
+    cameras = {name: {**camera_table(camera), "name": name} for name, camera in zip(NAMES, ring(3), strict=True)}
+    (folder / "calibration.toml").write_text(tomli_w.dumps(cameras))
+
+
+def run(folder: Path, *options: str) -> tuple[Result, Path]:
+    output = folder.parent / "CAPTURE"
+    return CliRunner().invoke(main, ["sync", str(folder), "-o", str(output), "-q", *options]), output
+
+
+def test_raw_folder_becomes_a_capture(copy: Path) -> None:
+    calibrate(copy)
+    result, capture = run(copy, "--json")
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)["cameras"]
+    assert [found[name]["offset_s"] for name in NAMES] == pytest.approx(STARTS, abs=0.008)
+    assert found["b"]["sigma_s"] < 0.02 and "known cameras" in found["b"]["method"]
+    document = load_toml(capture / "capture.toml")
+    assert (capture / document["videos"]["b"]["path"]).resolve() == copy / "b.mp4"
+    assert document["from"] == pytest.approx(2.2, abs=0.01) and document["fps"] == 20.0
+    assert sorted(path.name for path in capture.iterdir()) == ["calibration.toml", "capture.toml", "sync.png"]
+
+
+def test_second_run_does_not_replace_a_capture(copy: Path) -> None:
+    offsets = ("--offsets", "a=0,b=2.2,c=1")
+    assert run(copy, *offsets)[0].exit_code == 0
+    result, capture = run(copy, *offsets)
+    assert result.exit_code == 2 and "--force" in result.output
+    (capture / "capture.toml").write_text((capture / "capture.toml").read_text() + "\n[subject]\nheight = 1.7\n")
+    assert run(copy, *offsets, "--force", "--from", "3")[0].exit_code == 0
+    document = load_toml(capture / "capture.toml")
+    assert document["subject"]["height"] == 1.7 and document["from"] == 3.0
+
+
+def test_another_calibration_in_the_capture_is_replaced_only_if_asked_for(copy: Path) -> None:
+    offsets = ("--offsets", "a=0,b=2.2,c=1")
+    calibrate(copy)
+    capture = copy.parent / "CAPTURE"
+    capture.mkdir()
+    (capture / "calibration.toml").write_text("# of another day\n")
+    result, _ = run(copy, *offsets)
+    assert result.exit_code == 2 and "differs from" in result.output and not (capture / "capture.toml").exists()
+    assert run(copy, *offsets, "--force")[0].exit_code == 0
+    assert (capture / "calibration.toml").read_bytes() == (copy / "calibration.toml").read_bytes()
+
+
+def test_chapters_are_one_video(copy: Path) -> None:
+    (copy / "b.mp4").unlink()
+    (copy / "b").mkdir()
+    write(copy / "b" / "GX020012.MP4", seen(1, 6.0, 6.0))
+    write(copy / "b" / "GX010012.MP4", seen(1, 0.0, 6.0))
+    calibrate(copy)
+    result, capture = run(copy)
+    assert result.exit_code == 0, result.output
+    part = load_toml(capture / "capture.toml")["videos"]["b"]
+    assert [Path(path).name for path in part["path"]] == ["GX010012.MP4", "GX020012.MP4"]
+    assert part["offset"] == pytest.approx(2.2, abs=0.01)
+
+
+def other_sound(folder: Path) -> None:
+    still = seen(1)
+    other = Look(still.times_s, watch(ring(3)[1], [wander(8), wander(9)], 70.0, LENGTH_S, 25.0).greys)
+    write(folder / "b.mp4", other, heard(1, steps(9, LENGTH_S + 4)))
+
+
+def contradicting(folder: Path) -> None:
+    """The sound of b is 1 s late, its pictures are right."""
+    write(folder / "b.mp4", seen(1), np.roll(heard(1, steps(0, LENGTH_S + 4)), RATE))
+    calibrate(folder)
+
+
+def mirrored(folder: Path) -> None:
+    look = seen(1)
+    write(folder / "b.mp4", Look(look.times_s, look.greys[:, :, ::-1]))
+    calibrate(folder)
+
+
+def constant(folder: Path) -> None:
+    look = seen(1)
+    write(folder / "b.mp4", Look(look.times_s, np.repeat(look.greys[:1], len(look.greys), axis=0)))
+
+
+def no_sound_no_motion(folder: Path) -> None:
+    noise = np.random.default_rng(0).normal(100, 1.5, (250, 90, 160))
+    write(folder / "b.mp4", Look(np.arange(250) / 25, noise.astype(np.uint8)))
+
+
+def only_one(folder: Path) -> None:
+    for name in ("b", "c"):
+        (folder / f"{name}.mp4").unlink()
+
+
+FAULTS: dict[str, tuple[Callable[[Path], object], tuple[str, ...], str]] = {
+    "other sound and pictures": (other_sound, (), "camera b: not sure when it was recorded: its sound is another one"),
+    "contradiction": (contradicting, (), "camera b: not sure when it was recorded: its sound and its pictures"),
+    "mirrored": (mirrored, (), "camera b: not sure when it was recorded: its picture is mirrored"),
+    "constant": (constant, (), "camera b: shows the same picture all the time"),
+    "no sound, no motion": (no_sound_no_motion, (), "camera b: not sure when it was recorded: it has no sound"),
+    "one second": (lambda folder: write(folder / "b.mp4", seen(1, 0, 1.0)), (), "camera b: is 1.0 s long"),
+    "no video": (lambda folder: (folder / "b.mp4").write_bytes(b"text" * 99), (), "b.mp4: is not a video"),
+    "one camera": (only_one, (), "holds one camera, a"),
+    "two minutes late": (lambda _: None, ("--offsets", "a=0,b=120,c=1"), "camera b: has no time in common"),
+    "camera without offset": (lambda _: None, ("--offsets", "a=0,b=2"), "camera c is missing"),
+    "name": (lambda f: (calibrate(f), (f / "b.mp4").rename(f / "x.mp4")), (), "camera x: has no camera in"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_fault_is_one_line_that_names_the_camera(copy: Path, fault: str) -> None:
+    spoil, options, line = FAULTS[fault]
+    spoil(copy)
+    result, capture = run(copy, *options)
+    assert result.exit_code == 2, result.output
+    assert line in result.stderr and result.stderr.strip().count("\n") == 0, result.stderr
+    assert not (capture / "capture.toml").exists()

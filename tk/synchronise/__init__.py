@@ -1,0 +1,1 @@
+"""`tk sync`: what cameras recorded becomes a capture."""

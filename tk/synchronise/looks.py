@@ -1,0 +1,150 @@
+"""Small grey images of a recording, and what moves in them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import VideoError
+from tk.io.captures.packets import decoded, open_video, quarter_turns
+from tk.synchronise.raw import Recording
+
+Float = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+#: longer side of the small images, pixels. With 320 the offsets of known cameras are the same to a millisecond.
+SIDE_PX = 160
+#: seconds of each recording that are looked at, and highest rate, 1/s. Offsets up to a minute leave two in common.
+LOOKED_S, _MOST_HZ = 180.0, 62.0
+#: grey levels by which a pixel must change from image to image, beyond the noise, to count as moving; and a level above
+#: which a change counts no more: reflections
+_MOVES, _MOST = 3.0, 40.0
+#: grey levels by which coding changes the small images of one picture; the noise of a camera is more
+_CODING = 8
+
+
+@dataclass(frozen=True)
+class Look:
+    """Small images of a recording.
+
+    Attributes:
+        times_s: (N,) own times, seconds.
+        greys: (N, h, w) upright.
+        turns: counter-clockwise quarter turns that the file asked for.
+    """
+
+    times_s: Float
+    greys: Image
+    turns: int = 0
+
+    @cached_property
+    def brightness(self) -> Float:
+        """(N,) mean grey level."""
+        return np.asarray(self.greys.mean(axis=(1, 2)), np.float64)
+
+    @cached_property
+    def middles_s(self) -> Float:
+        """(N - 1,) own times of the changes: between two images."""
+        return np.asarray((self.times_s[1:] + self.times_s[:-1]) / 2)
+
+    @cached_property
+    def changes(self) -> NDArray[np.float32]:
+        """(N - 1, h, w) how much each pixel changes from image to image beyond noise and changes of the light, grey
+        levels."""
+        found = np.empty((len(self.greys) - 1, *self.greys.shape[1:]), np.float32)
+        for k in range(len(found)):
+            change = self.greys[k + 1].astype(np.float32) - self.greys[k]
+            change -= np.median(change)
+            found[k] = np.abs(change)
+        noise = max(float(np.percentile(found[:: max(1, len(found) // 50)], 70)), 0.7)
+        np.clip(found - 4 * noise - _MOVES, 0, _MOST, out=found)
+        return found
+
+    @property
+    def constant(self) -> bool:
+        """Whether all images are the same, up to their coding."""
+        return int((self.greys.max(axis=0) - self.greys.min(axis=0)).max()) <= _CODING
+
+
+def look_at(recording: Recording, begin_s: float | None = None, length_s: float = LOOKED_S) -> Look:
+    """Return small images of a part of a recording, which begins at an own time or with the recording.
+
+    Raises:
+        VideoError: an image cannot be decoded.
+    """
+    begin = recording.span[0] if begin_s is None else begin_s
+    times: list[float] = []
+    greys: list[Image] = []
+    turns = 0
+    least = 0.0
+    for time, image in _images(recording, begin, begin + length_s):
+        if times and time - times[-1] < least:
+            continue
+        least = 0.9 / _MOST_HZ
+        scale = SIDE_PX / max(image.width, image.height)
+        size = max(round(image.width * scale), 2), max(round(image.height * scale), 2)
+        small = image.reformat(*size, format="gray", interpolation="AREA").to_ndarray()
+        turns = quarter_turns(image)
+        times.append(time)
+        greys.append(np.ascontiguousarray(np.rot90(small, turns), np.uint8))
+    if len(times) < 2:
+        raise VideoError(f"{recording.paths[0]}: {recording.where}: has no pictures from {begin:.1f} s on")
+    return Look(np.array(times), np.stack(greys), turns)
+
+
+def pictures_at(recording: Recording, owns_s: list[float], height: int) -> list[Image]:
+    """Return the images (height, w, 3) BGR nearest to own times, ascending."""
+    wanted = [float(recording.times_s[np.abs(recording.times_s - own).argmin()]) for own in owns_s]
+    found: list[Image] = []
+    if not wanted:
+        return found
+    for time, image in _images(recording, wanted[0] - 1e-3, wanted[-1] + 1e-3):
+        while len(found) < len(wanted) and time > wanted[len(found)] - 1e-3:
+            picture = np.rot90(image.to_ndarray(format="bgr24"), quarter_turns(image))
+            width = round(picture.shape[1] * height / picture.shape[0])
+            small = cv2.resize(np.ascontiguousarray(picture), (width, height), interpolation=cv2.INTER_AREA)
+            found.append(np.asarray(small, np.uint8))
+        if len(found) == len(wanted):
+            break
+    return found
+
+
+def _images(recording: Recording, begin: float, end: float) -> Iterator[tuple[float, Any]]:
+    """Yield own times and decoded images from ``begin`` to ``end``; decoding starts at a key frame before."""
+    import av.error
+
+    last = -np.inf
+    for n, (path, shift) in enumerate(zip(recording.paths, recording.shifts_s, strict=True)):
+        later = recording.shifts_s[n + 1] if n + 1 < len(recording.shifts_s) else np.inf
+        if shift > end or (np.isfinite(later) and later + recording.times_s[0] < begin - 1.0):
+            continue
+        container, stream = open_video(path)
+        stream.thread_type = "AUTO"
+        with container:
+            start = begin - shift
+            if start > recording.times_s[0] - shift + 1.0:
+                try:
+                    container.seek(int((start - 0.5) / stream.time_base), stream=stream)
+                except av.error.FFmpegError:  # no index: decoded from the start
+                    container.seek(0)
+            try:
+                for image in decoded(container.demux(stream)):
+                    if image.time is None:
+                        continue
+                    time = float(image.time) + shift
+                    if time > end:
+                        return
+                    if time >= begin and time > last:
+                        last = time
+                        yield time, image
+            except av.error.FFmpegError:
+                raise VideoError(
+                    f"{path}: {recording.where}: cannot be decoded after {last:.1f} s: the file is cut off or damaged; "
+                    "copy it again"
+                ) from None

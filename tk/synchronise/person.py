@@ -1,0 +1,307 @@
+"""Offsets from what moves: signals of each camera, and with known cameras the motion in each epipolar plane.
+
+Without a calibration, the amount of motion and its vertical part are compared. With one, motion at a point of the world
+lies in one plane through the centres of two cameras; the motion in each plane, a function of time, is the same in both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from tk.model.cameras.camera import Camera
+from tk.synchronise.lags import correlate
+from tk.synchronise.looks import Look
+from tk.synchronise.ties import Tie
+
+Float = NDArray[np.float64]
+
+#: 1/s: of the clock on which signals are compared
+GRID_HZ = 120
+#: seconds that two recordings must have in common
+LEAST_S = 2.0
+#: planes of a pair of cameras; share of the motion beyond the planes at each end
+_PLANES, _BEYOND = 48, 0.01
+#: least sine of the angle between a ray and the line through both cameras: beside it, planes are not determined
+_LEAST_SINE = 0.2
+#: standard deviation of the lag of a pair, with known cameras and without: least, seconds, and share of an interval
+_SIGMA = {"cameras": (0.002, 0.06), "person": (0.005, 0.33)}
+#: seconds over which signals without known cameras are compared with their surroundings
+_SLOW_S = 1.5
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A pair of cameras, compared at each lag.
+
+    Attributes:
+        i, j: the cameras.
+        first: the first lag, samples of the grid.
+        z, r: (L,) significance and coefficient of each lag.
+        start_i, start_j: own time of sample 0 of each camera, seconds.
+        sine: of the angle between the line through both cameras and the rays to what moves: if it is small, planes are
+            determined badly. 1 without known cameras.
+    """
+
+    i: int
+    j: int
+    first: int
+    z: Float
+    r: Float
+    start_i: float
+    start_j: float
+    sine: float = 1.0
+
+    def at(self, lag: int) -> float:
+        """Return the significance of a lag; 0 outside the range."""
+        k = lag - self.first
+        return max(float(self.z[k]), -10.0) if 0 <= k < len(self.z) else 0.0
+
+
+def compare_signals(looks: Sequence[Look]) -> list[Compared]:
+    """Return every pair of cameras, compared by the amount of motion and its vertical part."""
+    signals = [_signals(look) for look in looks]
+    return [_compared(i, j, signals[i], signals[j]) for i, j in combinations(range(len(looks)), 2)]
+
+
+def compare_planes(looks: Sequence[Look], cameras: Sequence[Camera], mirrored: int = -1) -> list[Compared]:
+    """Return every pair of cameras, compared by the motion in epipolar planes; pairs that share too few planes are
+    missing. ``mirrored``: a camera whose images are mirrored before."""
+    rays = [_rays(look, camera, c == mirrored) for c, (look, camera) in enumerate(zip(looks, cameras, strict=True))]
+    pairs = list(combinations(range(len(looks)), 2))
+    if mirrored >= 0:
+        pairs = [pair for pair in pairs if mirrored in pair]
+
+    def one(pair: tuple[int, int]) -> Compared | None:
+        i, j = pair
+        profiles = _profiles(looks[i], looks[j], rays[i], rays[j], cameras[i].center, cameras[j].center)
+        return None if profiles is None else replace(_compared(i, j, *profiles[:2]), sine=profiles[2])
+
+    with ThreadPoolExecutor(2) as threads:
+        return [found for found in threads.map(one, pairs) if found is not None]
+
+
+def _signals(look: Look) -> tuple[float, Float]:
+    """Return the own time of the first sample, and signals (N, 2) on the grid: the amount of motion, its vertical
+    speed."""
+    amount, vertical = [], []
+    for k, change in enumerate(look.changes):
+        one, two = look.greys[k].astype(np.float32), look.greys[k + 1].astype(np.float32)
+        slope = cv2.Sobel(one + two, cv2.CV_32F, 0, 1, ksize=3) / 16
+        weight = change > 0
+        amount.append(float(np.sqrt(change).sum()))
+        along = two - one
+        below = float((slope[weight] ** 2).sum())
+        vertical.append(-float((along[weight] * slope[weight]).sum()) / (below + 50.0))
+    steps = np.diff(look.times_s)
+    values = np.stack([np.sqrt(np.array(amount) / steps), np.array(vertical) / steps], axis=1)
+    start, grid = on_grid(look.middles_s, values)
+    width = _SLOW_S * GRID_HZ
+    grid = grid - gaussian_filter1d(grid, width, axis=0, mode="nearest")
+    scale = 1.4826 * np.median(np.abs(grid), axis=0) + 0.3 * grid.std(axis=0) + 1e-9
+    grid = np.clip(grid / scale, -4, 4)  # one fast motion or glitch must not decide
+    return start, grid - grid.mean(axis=0)
+
+
+def on_grid(times: Float, values: Float) -> tuple[float, Float]:
+    """Return the own time of the first sample, and values (N, F) at ``times`` (N,) on the grid."""
+    clock = times[0] + np.arange(int((times[-1] - times[0]) * GRID_HZ) + 1) / GRID_HZ
+    return float(times[0]), np.stack([np.interp(clock, times, column) for column in values.T], axis=1)
+
+
+def _compared(i: int, j: int, one: tuple[float, Float], other: tuple[float, Float]) -> Compared:
+    lags, r, z = correlate(one[1], other[1], round(LEAST_S * GRID_HZ))
+    return Compared(i, j, int(lags[0]), z, r, one[0], other[0])
+
+
+def _rays(look: Look, camera: Camera, mirrored: bool) -> Float:
+    """Return (h, w, 3) viewing directions of the small images' pixels, world frame.
+
+    A calibration of images that are not turned has the other side longer.
+    """
+    height, width = look.greys.shape[1:]
+    unturned = look.turns % 2 == 1 and (camera.width > camera.height) != (width > height)
+    shape = (width, height) if unturned else (height, width)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    x, y = (x + 0.5) * camera.width / shape[1] - 0.5, (y + 0.5) * camera.height / shape[0] - 0.5
+    rays = camera.rays(np.stack([x.ravel(), y.ravel()], axis=1)).reshape(*shape, 3)
+    rays = np.rot90(rays, look.turns) if unturned else rays
+    return np.asarray(rays[:, ::-1] if mirrored else rays)
+
+
+def _profiles(
+    a: Look, b: Look, rays_a: Float, rays_b: Float, center_a: Float, center_b: Float
+) -> tuple[tuple[float, Float], tuple[float, Float], float] | None:
+    """Return the motion in each plane through the centres, (N, P) on the grid, for both cameras, and the sine of
+    :class:`Compared`; None if they share too few planes."""
+    base = center_b - center_a
+    base = base / np.linalg.norm(base)
+    side = np.cross(base, np.eye(3)[np.argmin(np.abs(base))])
+    side /= np.linalg.norm(side)
+    third = np.cross(base, side)
+    angles, usable, totals, means = [], [], [], []
+    for look, rays in ((a, rays_a), (b, rays_b)):
+        angles.append(np.arctan2(rays @ third, rays @ side))
+        sine = np.linalg.norm(np.cross(rays, base), axis=2)
+        usable.append(sine > _LEAST_SINE)
+        totals.append(np.where(usable[-1], look.changes.sum(axis=0), 0.0))
+        means.append(float((sine * totals[-1]).sum() / max(totals[-1].sum(), 1e-9)))
+    if not all(total.any() for total in totals):
+        return None
+    middle = float(np.angle((totals[0] * np.exp(1j * angles[0])).sum()))
+    angles = [(angle - middle + np.pi) % (2 * np.pi) - np.pi for angle in angles]
+    ranges = [_quantiles(angle.ravel(), total.ravel()) for angle, total in zip(angles, totals, strict=True)]
+    low, high = max(r[0] for r in ranges), min(r[1] for r in ranges)
+    if high - low < 0.3 * max(r[1] - r[0] for r in ranges):
+        return None
+    found = []
+    for look, angle, use in zip((a, b), angles, usable, strict=True):
+        plane = np.floor((angle - low) / (high - low) * _PLANES).astype(int)
+        inside = use & (plane >= 0) & (plane < _PLANES)
+        which = plane[inside]
+        sums = np.stack([np.bincount(which, change[inside], _PLANES) for change in look.changes])
+        sums = np.sqrt(gaussian_filter1d(sums, 1.0, axis=1) / np.diff(look.times_s)[:, None])
+        start, grid = on_grid(look.middles_s, sums)
+        found.append((start, grid - grid.mean(axis=0)))
+    return found[0], found[1], min(means)
+
+
+def _quantiles(values: Float, weights: Float) -> tuple[float, float]:
+    order = np.argsort(values)
+    share = np.cumsum(weights[order]) / weights.sum()
+    low, high = np.searchsorted(share, [_BEYOND, 1 - _BEYOND])
+    return float(values[order][low]), float(values[order][high])
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """Lags of all cameras that fit all pairs best.
+
+    Attributes:
+        ties: of all pairs, refined to a fraction of a frame.
+        best, second: (C,) mean significance over a camera's pairs, and the largest with another lag of the camera.
+    """
+
+    ties: tuple[Tie, ...]
+    best: Float
+    second: Float
+
+
+def align(pairs: Sequence[Compared], count: int, intervals_s: Sequence[float], kind: str) -> Aligned:
+    """Return the lags of ``count`` cameras with the highest sum of significances, and how certain each camera is.
+
+    A camera's lag is certain if no other lag of it is nearly as good, with the other cameras' lags as they are.
+    """
+    by_pair = {(pair.i, pair.j): pair for pair in pairs}
+
+    def between(i: int, j: int, lag: int) -> float:
+        """Return the significance if sample k of i shows the instant of sample k - lag of j."""
+        pair = by_pair.get((min(i, j), max(i, j)))
+        return 0.0 if pair is None else pair.at(lag if i < j else -lag)
+
+    best: tuple[float, dict[int, int]] = (-np.inf, {})
+    for pair in pairs:
+        for lag in _peaks(pair.z, 3):
+            placed = _place(count, by_pair, {pair.i: 0, pair.j: -(lag + pair.first)})
+            score = sum(between(i, j, placed[i] - placed[j]) for i, j in combinations(sorted(placed), 2))
+            if score > best[0]:
+                best = score, placed
+    placed = best[1]
+    mean, second = np.full(count, -np.inf), np.full(count, np.inf)
+    for c in placed:
+        start, total, number = _total(c, by_pair, {k: at for k, at in placed.items() if k != c})
+        if not number:
+            continue
+        k = placed[c] - start
+        away = np.abs(np.arange(len(total)) - k) > round(max(0.35, 3 * intervals_s[c]) * GRID_HZ)
+        mean[c] = total[k] / number
+        second[c] = total[away].max() / number if away.any() else 0.0
+    ties = [_tie(pair, -placed[pair.j] + placed[pair.i], intervals_s, kind) for pair in pairs
+            if pair.i in placed and pair.j in placed]  # fmt: skip
+    return Aligned(tuple(tie for tie in ties if tie is not None), mean, second)
+
+
+def _place(count: int, pairs: dict[tuple[int, int], Compared], placed: dict[int, int]) -> dict[int, int]:
+    """Return the positions of all cameras: each further one where it fits those before best, then all once more."""
+    placed = dict(placed)
+    for repeat in range(2):
+        waiting = [c for c in range(count) if c not in placed] if repeat == 0 else list(placed)
+        while waiting:
+            tried = []
+            for c in waiting:
+                start, total, number = _total(c, pairs, {k: at for k, at in placed.items() if k != c})
+                if number:
+                    tried.append((float(total.max()), c, start + int(np.argmax(total))))
+            if not tried:
+                break
+            _, c, at = max(tried) if repeat == 0 else tried[0]
+            placed[c] = at
+            waiting.remove(c)
+    return placed
+
+
+def _total(c: int, pairs: dict[tuple[int, int], Compared], placed: dict[int, int]) -> tuple[int, Float, int]:
+    """Return the first position, the sum of the significances of a camera with the placed ones by position, and the
+    number of pairs.
+
+    The lag between cameras i and j is the difference of their positions.
+    """
+    parts: list[tuple[int, Float]] = []
+    for other, at in placed.items():
+        pair = pairs.get((min(c, other), max(c, other)))
+        if pair is None:
+            continue
+        z = np.maximum(pair.z, -10.0)
+        # lag = placed[i] - placed[j]
+        first = at + pair.first if c < other else at - (pair.first + len(z) - 1)
+        parts.append((first, z if c < other else z[::-1]))
+    if not parts:
+        return 0, np.zeros(1), 0
+    start = min(first for first, _ in parts)
+    total = np.zeros(max(first + len(each) for first, each in parts) - start)
+    for first, each in parts:
+        total[first - start : first - start + len(each)] += each
+    return start, total, len(parts)
+
+
+def _peaks(z: Float, most: int) -> list[int]:
+    """Return the highest lags that lie apart by half a second."""
+    left, found = np.array(z), []
+    for _ in range(most):
+        k = int(np.argmax(left))
+        if not np.isfinite(left[k]):
+            break
+        found.append(k)
+        left[max(0, k - GRID_HZ // 2) : k + GRID_HZ // 2] = -np.inf
+    return found
+
+
+def _tie(pair: Compared, lag: int, intervals_s: Sequence[float], kind: str) -> Tie | None:
+    """Return the tie at the peak near a lag: the maximum of a parabola over an interval on each side."""
+    interval = max(intervals_s[pair.i], intervals_s[pair.j])
+    reach = max(round(1.5 * interval * GRID_HZ), 2)
+    k = lag - pair.first
+    low, high = max(k - reach, 0), min(k + reach + 1, len(pair.r))
+    if high - low < 3:
+        return None
+    k = low + int(np.argmax(pair.r[low:high]))
+    half = max(round(interval * GRID_HZ), 2)
+    near = np.arange(max(k - half, 0), min(k + half + 1, len(pair.r)))
+    curve, slope, _ = np.polyfit(near - k, pair.r[near], 2)
+    if curve >= 0:
+        return None
+    lag_s = (k + float(np.clip(-slope / (2 * curve), -half, half)) + pair.first) / GRID_HZ
+    least, share = _SIGMA[kind]
+    sigma = (least + share * interval) / pair.sine**2
+    # the middle of the samples that both have
+    count_j = 1 - pair.first
+    count_i = len(pair.z) + 1 - count_j
+    own = (max(0.0, lag_s) + min(count_i / GRID_HZ, lag_s + count_j / GRID_HZ)) / 2
+    return Tie(pair.i, pair.j, pair.start_i + own, pair.start_j + own - lag_s, sigma, kind)

@@ -1,0 +1,198 @@
+"""`tk sync`, all steps: read, compare by each method, decide, and look."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import CaptureError, VideoError
+from tk.model.cameras.camera import Camera
+from tk.model.cameras.common_view import closest_to_lines
+from tk.synchronise.decide import Decision, decide, timecode_ties
+from tk.synchronise.flash import compare_events
+from tk.synchronise.looks import LOOKED_S, Look, look_at
+from tk.synchronise.person import Aligned, align, compare_planes, compare_signals
+from tk.synchronise.raw import Recording
+from tk.synchronise.sound import hear, read_track
+from tk.synchronise.ties import Clocks, Tie, connected_to
+
+Float = NDArray[np.float64]
+
+#: methods that find offsets; the user can choose
+METHODS = ("sound", "flash", "person", "timecode")
+#: a camera's lag is certain if the mean significance over its pairs is above this, and above that of its second best
+#: lag by this factor; without and with known cameras. Chosen on raw folders made of two rendered recordings; the share
+#: of false lags above them has not been measured.
+_SURE, _SECOND = {"person": 5.0, "cameras": 6.0}, {"person": 1.35, "cameras": 1.25}
+#: a mirrored image fits better than the image by this factor
+_MIRRORED = 1.5
+#: speed of sound in air, m/s
+SOUND_M_S = 343.0
+
+
+@dataclass
+class Synchronised:
+    """The result.
+
+    Attributes:
+        recordings: the cameras; the first is the reference.
+        decision: clocks, methods, notes.
+        looks: small images of each camera.
+        mirrored: cameras whose images are mirrored.
+    """
+
+    recordings: list[Recording]
+    decision: Decision
+    looks: list[Look]
+    mirrored: list[int] = field(default_factory=list)
+
+    @property
+    def clocks(self) -> Clocks:
+        """The clocks of all cameras."""
+        return self.decision.clocks
+
+
+def synchronise(
+    recordings: list[Recording],
+    cameras: Sequence[Camera] = (),
+    methods: Sequence[str] = METHODS,
+    begin_s: float | None = None,
+    progress: Callable[[str], object] = str,
+) -> Synchronised:
+    """Find the clocks of all cameras by sound, flashes, and motion, which check each other.
+
+    Args:
+        recordings: the cameras; the first is the reference.
+        cameras: their calibration; empty if it is unknown.
+        methods: methods of :data:`METHODS` that are used.
+        begin_s: own time of the first camera at which pictures are looked at; None: at its start.
+        progress: called with what is done next.
+
+    Raises:
+        VideoError: a video cannot be decoded, or shows the same picture all the time.
+    """
+    count = len(recordings)
+    ties: list[Tie] = []
+    reasons: dict[int, list[str]] = {c: [] for c in range(count)}
+    if "sound" in methods:
+        progress("comparing the sound")
+        with ThreadPoolExecutor(2) as threads:
+            tracks = list(threads.map(read_track, recordings))
+        heard = hear(tracks)
+        found = [tie for each in heard.values() for tie in each.ties]
+        if cameras:
+            found = without_travel_time(found, cameras)
+        ties += found
+        linked = connected_to(0, count, [(tie.i, tie.j) for tie in found])
+        for c in np.flatnonzero(~linked).tolist():
+            silent = tracks[c] is None or tracks[c].silent
+            reasons[c].append("it has no sound" if silent else "its sound is another one")
+    looks = _look(recordings, ties, begin_s, progress)
+    if "flash" in methods:
+        ties += compare_events(looks)
+    mirrored: list[int] = []
+    if "person" in methods:
+        progress("comparing what moves")
+        kind = "cameras" if cameras else "person"
+        pairs = compare_planes(looks, cameras) if cameras else compare_signals(looks)
+        aligned = align(pairs, count, [recording.interval_s for recording in recordings], kind)
+        sure = _sure(aligned, kind)
+        ties += [tie for tie in aligned.ties if sure[tie.i] and sure[tie.j]]
+        if cameras and not sure.all() and count > 2:
+            mirrored = _mirrored(looks, cameras, aligned, sure)
+        for c in np.flatnonzero(~sure).tolist():
+            still = "nothing moves in it" if not looks[c].changes.any() else "its motion fits none of the others"
+            reasons[c].append("its picture is mirrored" if c in mirrored else still)
+    if "timecode" in methods:
+        ties += timecode_ties(recordings)
+    decision = decide(recordings, ties, reasons)
+    for c in mirrored:
+        decision.unsure[c] = "its picture is mirrored, by the calibration; turn mirroring off in the camera"
+    return Synchronised(recordings, decision, looks, mirrored)
+
+
+def without_travel_time(ties: list[Tie], cameras: Sequence[Camera]) -> list[Tie]:
+    """Return ties of sound as if it had been made at each camera: it comes from where all cameras look at, to some
+    metres."""
+    centers = np.array([camera.center for camera in cameras])
+    middle = closest_to_lines(centers, np.array([camera.rotation[2] for camera in cameras]))
+    if middle is None:
+        return ties
+    travel_s = np.linalg.norm(centers - middle, axis=1) / SOUND_M_S
+    return [replace(tie, own_i=tie.own_i - travel_s[tie.i], own_j=tie.own_j - travel_s[tie.j]) for tie in ties]
+
+
+def by_hand(recordings: list[Recording], offsets_s: dict[str, float], begin_s: float | None) -> Synchronised:
+    """Return the clocks of offsets, seconds, that the user gives for every camera.
+
+    Raises:
+        CaptureError: a camera is unknown or missing.
+    """
+    names = [recording.name for recording in recordings]
+    for name in offsets_s:
+        if name not in names:
+            raise CaptureError(f"--offsets: there is no camera {name!r}; the cameras are {', '.join(names)}")
+    for name in names:
+        if name not in offsets_s:
+            raise CaptureError(f"--offsets: camera {name} is missing; give one for each of {', '.join(names)}")
+    count = len(names)
+    nan = np.full(count, np.nan)
+    offsets = np.array([offsets_s[name] for name in names])
+    clocks = Clocks(offsets, np.ones(count), nan, nan, np.zeros(count))
+    decision = Decision(clocks, ["by hand"] * count)
+    ties = [Tie(0, c, offsets[c] - offsets[0], 0.0, 1.0, "hand") for c in range(1, count)]
+    return Synchronised(recordings, decision, _look(recordings, ties, begin_s, str))
+
+
+def _look(
+    recordings: Sequence[Recording], ties: Sequence[Tie], begin_s: float | None, progress: Callable[[str], object]
+) -> list[Look]:
+    """Return small images of each camera: where ties connect it to the first, of the part that both show."""
+    progress("looking at the pictures")
+    ahead = {0: 0.0}  # own time of the first camera minus that of another
+    for _ in recordings:
+        for tie in ties:
+            for a, b, own_a, own_b in ((tie.i, tie.j, tie.own_i, tie.own_j), (tie.j, tie.i, tie.own_j, tie.own_i)):
+                if a in ahead and b not in ahead:
+                    ahead[b] = ahead[a] + own_a - own_b
+    start = max(recordings[c].span[0] + shift for c, shift in ahead.items())
+    start = start if begin_s is None else max(start, begin_s)
+
+    def look(c: int) -> Look:
+        recording = recordings[c]
+        own = start - ahead[c] if c in ahead else None
+        if own is None or len(ahead) == 1:  # nothing is known: from the start, or from where the user says
+            own = None if begin_s is None else max(begin_s - 60.0, recording.span[0])
+        if own is not None and own > recording.span[1] - 1.0:
+            own = None
+        return look_at(recording, own, LOOKED_S)
+
+    with ThreadPoolExecutor(2) as threads:
+        looks = list(threads.map(look, range(len(recordings))))
+    for recording, each in zip(recordings, looks, strict=True):
+        if each.constant:
+            raise VideoError(
+                f"{recording.paths[0]}: {recording.where}: shows the same picture all the time; record it again, or "
+                "leave it out with --cameras"
+            )
+    return looks
+
+
+def _sure(aligned: Aligned, kind: str) -> NDArray[np.bool_]:
+    """Return (C,) whether the lag of each camera is certain."""
+    return np.asarray((aligned.best > _SURE[kind]) & (aligned.best > _SECOND[kind] * np.maximum(aligned.second, 0.0)))
+
+
+def _mirrored(looks: Sequence[Look], cameras: Sequence[Camera], aligned: Aligned, sure: NDArray[np.bool_]) -> list[int]:
+    """Return cameras whose mirrored images fit the others, and whose images do not."""
+    found = []
+    for c in np.flatnonzero(~sure).tolist():
+        pairs = compare_planes(looks, cameras, mirrored=c)
+        best = [float(np.max(pair.z)) for pair in pairs]
+        if best and np.mean(best) > max(_SURE["cameras"], _MIRRORED * float(aligned.best[c])):
+            found.append(c)
+    return found

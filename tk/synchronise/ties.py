@@ -1,0 +1,154 @@
+"""Ties between the clocks of cameras, and the offsets and rates that fit them best."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+#: standard deviation of the clock rates of consumer cameras, relative
+RATE_SIGMA = 50e-6
+#: standard deviation of the time between sound and pictures of a camera, seconds: a way of some metres, and what the
+#: device adds
+SOUND_SIGMA_S = 0.015
+#: a pair of cameras is an outlier if its ties differ from the others' solution by more than so many sigma, and by more
+#: than this, seconds
+_OUTLIER_SIGMA, _OUTLIER_S = 5.0, 0.01
+#: a rate counts as determined if its standard deviation is below this, relative
+KNOWN_RATE = 15e-6
+#: prior of a rate that is not estimated, relative
+_FIXED = 1e-12
+
+
+@dataclass(frozen=True)
+class Tie:
+    """An instant as two cameras recorded it.
+
+    Attributes:
+        i, j: the cameras.
+        own_i, own_j: its own time in each, seconds.
+        sigma_s: standard deviation of the difference, seconds.
+        kind: the method: "sound", "flash", "person", "cameras" or "timecode".
+    """
+
+    i: int
+    j: int
+    own_i: float
+    own_j: float
+    sigma_s: float
+    kind: str
+
+
+@dataclass(frozen=True)
+class Clocks:
+    """Clocks of C cameras: common time = offset + rate · own time.
+
+    Attributes:
+        offsets_s, rates: (C,); NaN for cameras that no tie connects to the reference.
+        offset_sigma_s: (C,) standard deviation of the common time in the middle of the ties, seconds.
+        rate_sigma: (C,) standard deviations; that of the prior where nothing determines a rate.
+        skew_s: (C,) by how much the sound of each camera is late, seconds, relative to its pictures.
+        dropped: pairs of cameras and methods that contradict the others.
+    """
+
+    offsets_s: Float
+    rates: Float
+    offset_sigma_s: Float
+    rate_sigma: Float
+    skew_s: Float
+    dropped: tuple[tuple[int, int, str], ...] = ()
+
+    @property
+    def connected(self) -> NDArray[np.bool_]:
+        """(C,) whether a camera is connected to the reference."""
+        return np.isfinite(self.offsets_s)
+
+    def common(self, camera: int, own: float) -> float:
+        """Return the common time, seconds, of a camera's own time."""
+        return float(self.offsets_s[camera] + self.rates[camera] * own)
+
+
+def connected_to(reference: int, count: int, pairs: Iterable[tuple[int, int]]) -> NDArray[np.bool_]:
+    """Return (count,) which cameras pairs connect to the reference."""
+    found, links = {reference}, list(pairs)
+    while more := {a for i, j in links for a in (i, j) if (i in found) != (j in found)} - found:
+        found |= more
+    return np.isin(np.arange(count), list(found))
+
+
+def solve(count: int, ties: Sequence[Tie], reference: int = 0, skew_sigma_s: float = SOUND_SIGMA_S) -> Clocks:
+    """Return the clocks of ``count`` cameras that fit the ties best, by least squares; the reference's offset is 0 and
+    its rate 1.
+
+    Pairs of cameras that contradict the others are left out, the worst first, as long as all cameras stay connected.
+    """
+    kept = list(ties)
+    dropped: list[tuple[int, int, str]] = []
+    while True:
+        clocks, residuals = _fit(count, kept, reference, skew_sigma_s, np.full(count, RATE_SIGMA))
+        worst, size = None, 1.0
+        for pair in {(tie.i, tie.j, tie.kind) for tie in kept}:
+            own = [(r, tie) for r, tie in zip(residuals, kept, strict=True) if (tie.i, tie.j, tie.kind) == pair]
+            off = abs(float(np.median([r for r, _ in own])))
+            limit = max(_OUTLIER_S, _OUTLIER_SIGMA * float(np.median([tie.sigma_s for _, tie in own])))
+            rest = [(tie.i, tie.j) for tie in kept if (tie.i, tie.j, tie.kind) != pair]
+            same = np.array_equal(connected_to(reference, count, rest), clocks.connected)
+            if off > limit * size and same:
+                worst, size = pair, off / limit
+        if worst is None:
+            rate_sigma = np.where(clocks.rate_sigma < KNOWN_RATE, RATE_SIGMA, _FIXED)
+            final, _ = _fit(count, kept, reference, skew_sigma_s, rate_sigma)
+            final.offsets_s[:] += 0.0  # no negative zero
+            return replace(final, rate_sigma=clocks.rate_sigma, dropped=tuple(dropped))
+        dropped.append(worst)
+        kept = [tie for tie in kept if (tie.i, tie.j, tie.kind) != worst]
+
+
+def _fit(
+    count: int, ties: Sequence[Tie], reference: int, skew_sigma_s: float, rate_sigma: Float
+) -> tuple[Clocks, Float]:
+    """Return the clocks and the residual of each tie, seconds; ``rate_sigma`` (C,): prior of the rates."""
+    known = connected_to(reference, count, [(tie.i, tie.j) for tie in ties])
+    used = [tie for tie in ties if known[tie.i]]
+    middle = np.zeros(count)  # own times about which rates act, so that offsets and rates are nearly independent
+    for c in range(count):
+        at = [tie.own_i if tie.i == c else tie.own_j for tie in used if c in (tie.i, tie.j)]
+        middle[c] = (min(at) + max(at)) / 2 if at else 0.0
+    rows, right = [], []
+    for tie in used:
+        row = np.zeros(3 * count)
+        for c, own, sign in ((tie.i, tie.own_i, 1.0), (tie.j, tie.own_j, -1.0)):
+            row[c] = sign
+            row[count + c] = sign * (own - middle[c])
+            row[2 * count + c] = -sign * (tie.kind == "sound")
+        rows.append(row / tie.sigma_s)
+        right.append((tie.own_j - tie.own_i) / tie.sigma_s)
+    for c in range(count):
+        prior_rate = _FIXED if c == reference else float(rate_sigma[c])
+        for k, sigma in ((count + c, prior_rate), (2 * count + c, skew_sigma_s)):
+            row = np.zeros(3 * count)
+            row[k] = 1 / sigma
+            rows.append(row)
+            right.append(0.0)
+        if c == reference or not known[c]:
+            row = np.zeros(3 * count)
+            row[c] = 1e9
+            rows.append(row)
+            right.append(0.0)
+    A, b = np.array(rows), np.array(right)
+    normal = np.linalg.inv(A.T @ A)
+    x = normal @ (A.T @ b)
+    sigma = np.sqrt(np.maximum(np.diag(normal), 0.0))
+    residuals = np.full(len(ties), 0.0)
+    inner = A[: len(used)] @ x - b[: len(used)]
+    residuals[[k for k, tie in enumerate(ties) if known[tie.i]]] = inner * [tie.sigma_s for tie in used]
+    offsets = x[:count] - x[count : 2 * count] * middle
+    nan = np.where(known, 0.0, np.nan)
+    clocks = Clocks(
+        offsets + nan, 1.0 + x[count : 2 * count], sigma[:count] + nan, sigma[count : 2 * count], x[2 * count :]
+    )
+    return clocks, residuals
