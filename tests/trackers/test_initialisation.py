@@ -131,7 +131,7 @@ def test_poses_with_similar_costs_in_one_frame_all_become_hypotheses(monkeypatch
     )
     starts = tracker.world.poses_in(np.array([wrong, right]))
     monkeypatch.setattr("tk.trackers.proposals.anywhere.gait.hypotheses", lambda *_: starts)
-    monkeypatch.setattr("tk.trackers.proposals.exchanged.propose", lambda *_: starts)
+    monkeypatch.setattr("tk.trackers.proposals.opposite.propose", lambda *_: starts)
     monkeypatch.setattr("tk.trackers.proposals.anywhere.REFINED", 1)
     monkeypatch.setattr("tk.trackers.initialisation._searched", lambda _, __, pose: pose)
     costs = {False: 20.0, True: 20.5}

@@ -9,6 +9,7 @@ import signal
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import h5py
@@ -317,6 +318,11 @@ def test_a_person_who_was_tracked_back_to_front_is_tracked_again(
         tracker.start_at(tracker.turned_pose(pose))
 
     monkeypatch.setattr(RegionTracker, "start", start_turned)
+    run(tiny, tmp_path / "proposed.h5", causal=True, frames=(0, 5))
+    assert mean_error(read_result(tmp_path / "proposed.h5"), tiny) < 0.08, "the first pass finds the heading by itself"
+    monkeypatch.setattr(
+        "tk.trackers.region.of_heading", SimpleNamespace(propose=lambda _, __, pose: np.empty((0, len(pose))))
+    )
     errors = []
     for causal in (True, False):
         reporter = Silent()

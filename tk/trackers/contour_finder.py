@@ -37,7 +37,7 @@ from tk.optim import gauss_newton
 from tk.optim.gauss_newton import BatchSolution, GaussNewtonSettings
 from tk.optim.quadratic import Quadratic
 from tk.settings import SilhouetteSettings
-from tk.trackers.hypotheses import SAME_POSE_M, TrajectoryHypothesis, turning
+from tk.trackers.hypotheses import PROPOSED, SAME_POSE_M, TrajectoryHypothesis, turning
 from tk.trackers.initialisation import find_person, stature_of
 from tk.trackers.proposals import exchanged, limbs
 from tk.trackers.proposals.anywhere import centroid
@@ -358,9 +358,13 @@ class ContourFinder:
         return evidence.costs(self.body, poses)
 
     def compared(self, seen: Seen, pose: Float, *proposed: Float) -> tuple[Float, Float]:
-        """Settle proposed poses (B, D). Return a pose (D,) and those of them that differ from it, (1 + B', D), and the
-        negative logarithms of their posteriors, nats, up to a constant of the frame."""
+        """Settle proposed poses (B, D), unless they cost too much for it. Return a pose (D,) and those of them that
+        differ from it, (1 + B', D), and the negative logarithms of their posteriors, nats, up to a constant of the
+        frame."""
         skeleton, found = self.body.skeleton, np.concatenate(proposed)
+        if len(found):
+            cost = seen.evidence.score(self.body, np.concatenate([pose[None], found]))
+            found = found[cost[1:] + turning(skeleton, found, pose) <= cost[0] + PROPOSED]
         if len(found):
             found = self.settle(seen.pyramid, found, (0,), seen.images).states
         found = np.concatenate([pose[None], found[skeleton.apart(found, skeleton.joints(pose)) > SAME_POSE_M]])

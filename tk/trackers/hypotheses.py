@@ -15,6 +15,8 @@ Float = NDArray[np.float64]
 # A hypothesis is dropped if its probability is below 1e-3 of the best one's; nats. The prior of a pose that faces the
 # other way than the person did in the frame before is as low.
 DROPPED = float(np.log(1000.0))
+# A pose that has not settled at the finest scale is not refined if it costs so much more than the present one, nats.
+PROPOSED = 16.0
 # Frames during which a hypothesis is tracked beside the best one, and the share of its running cost that a frame
 # replaces. Half and twice of each change the mean errors of dance and cube (50 frames) by less than 0.1 cm.
 PATIENCE, RENEWAL = 6, 0.4

@@ -26,7 +26,7 @@ from tk.model.cues.ray_costs import Evidence
 from tk.model.masks.silhouettes import Pyramid
 from tk.model.setup import AVERAGE_STATURE_M
 from tk.trackers.hypotheses import DROPPED, SAME_START_M, TrajectoryHypothesis, different, walking
-from tk.trackers.proposals import anywhere, exchanged, landmarks
+from tk.trackers.proposals import anywhere, landmarks, opposite
 from tk.trackers.proposals.anywhere import centroid
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ def _find(finder: ContourFinder, seen: Seen) -> tuple[float, Float]:
     improbable beside it."""
     skeleton = finder.body.skeleton
     found = np.concatenate([anywhere.propose(finder, seen), landmarks.propose(finder, seen)])
-    both = [exchanged.propose(finder, seen, pose, range(finder.solver.scales)[::-1])[-1:] for pose in found[:OPPOSITE]]
+    both = [opposite.propose(finder, seen, pose, range(finder.solver.scales)[::-1]) for pose in found[:OPPOSITE]]
     found = different(skeleton, np.concatenate([found, *both]), SAME_START_M)
     poses = np.array([_searched(finder, seen, pose) for pose in found])
     cost = seen.evidence.score(finder.body, poses)

@@ -45,9 +45,19 @@ from tk.optim.quadratic import Quadratic
 from tk.settings import RegionSettings, Settings, SilhouetteSettings
 from tk.trackers.contour_finder import INFORMATION, Seen
 from tk.trackers.contour_tracker import RECOVER_EVERY, ContourTracker
-from tk.trackers.hypotheses import DROPPED, PATIENCE, RENEWAL, SAME_POSE_M, Hypothesis, disagreement, walking
+from tk.trackers.hypotheses import (
+    DROPPED,
+    PATIENCE,
+    PROPOSED,
+    RENEWAL,
+    SAME_POSE_M,
+    Hypothesis,
+    disagreement,
+    walking,
+)
 from tk.trackers.proposals import exchanged, limbs
 from tk.trackers.proposals import landmarks as of_landmarks
+from tk.trackers.proposals import opposite as of_heading
 from tk.trackers.protocol import Estimate, Frame, Stopwatch
 from tk.trackers.residual import BaselineState, ResidualBaseline, variance_factor
 from tk.trackers.second_pass import STATURE, SecondPass
@@ -207,6 +217,9 @@ class RegionTracker(ContourTracker[RegionState]):
             self.settle(pyramid, np.stack([pose, turned(pose, self.limbs)])).states
             for pyramid, pose in zip(seen, inside, strict=True)
         ])  # fmt: skip
+        present, opposite = (np.mean(list(map(self.score, seen, one[:, None]))) for one in both.swapaxes(0, 1))
+        if opposite > present + PROPOSED:
+            return ()
         for i, (shown, pyramid) in enumerate(zip(masks, seen, strict=True)):
             frame = Frame(i, np.empty((len(shown), 0, 0, 3), np.uint8), shown)
             both[i, 1] = self.improved(self.see(frame, pyramid=pyramid), both[i, 1])
@@ -255,6 +268,7 @@ class RegionTracker(ContourTracker[RegionState]):
         best, proposed = self._best.pose, [of_landmarks.propose(self, seen)]
         if searched:
             proposed += [limbs.propose(self, seen, best, misplaced), exchanged.propose(self, seen, best)]
+            proposed.append(of_heading.propose(self, seen, best))
         if self._choose(seen, *proposed):
             look = self._look(seen)
         watch.lap("search")

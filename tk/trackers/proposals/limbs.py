@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tk.kernels.raycast import Cast
 from tk.model.body.limb_candidates import Limb
-from tk.trackers.hypotheses import SAME_POSE_M
+from tk.trackers.hypotheses import PROPOSED, SAME_POSE_M
 
 if TYPE_CHECKING:
     from tk.trackers.contour_finder import ContourFinder, Seen
@@ -24,9 +24,9 @@ CANDIDATES, MORE_CANDIDATES, NEARBY = 8, 16, 80
 # Screening stops at a candidate of which this share lies outside the silhouettes. With 0.2 and 0.8 the mean errors
 # of dance and cube (60 frames) change by less than 0.05 cm.
 OUTSIDE = 0.4
-# A candidate is not refined if it costs so much more than the current pose, nats; after the limb alone has converged,
-# it is dropped if it costs so much more. With four views this is half of a cost of 0.13, and 0.01, as chosen before.
-PROPOSED, PROMISING = 16.0, 2.5
+# A candidate is dropped if it costs so much more than the current pose after the limb alone has converged, nats. With
+# four views this is a cost of 0.01, as chosen before.
+PROMISING = 2.5
 # Poses that are proposed, at most.
 FINISHED = 2
 
