@@ -129,11 +129,9 @@ def test_poses_with_similar_costs_in_one_frame_all_become_hypotheses(monkeypatch
     monkeypatch.setattr(
         tracker, "settle", lambda _, starts, *__: BatchSolution(np.array(starts), np.zeros(0), np.zeros(3, np.int32))
     )
-    starts = tracker.world.poses_in(np.array([wrong, right]))
+    starts = tracker.world.poses_in(np.array([wrong, *3 * [right]]))
     monkeypatch.setattr("tk.trackers.proposals.anywhere.gait.hypotheses", lambda *_: starts)
     monkeypatch.setattr("tk.trackers.proposals.opposite.propose", lambda *_: starts)
-    monkeypatch.setattr("tk.trackers.proposals.anywhere.REFINED", 1)
-    monkeypatch.setattr("tk.trackers.initialisation._searched", lambda _, __, pose: pose)
     costs = {False: 20.0, True: 20.5}
     inside = tracker.world.poses_in(right)
     monkeypatch.setattr(
