@@ -37,6 +37,8 @@ Float = NDArray[np.float64]
 
 # Headings, and walking phases of each, from which the person is searched for.
 HEADINGS, PHASES = 8, 8
+# Poses of the landmarks from which the person is searched for, the likeliest ones.
+SIGHTED = 4
 # Poses that differ by more than this, mean over the joints, metres, are different hypotheses. Coarser than the limb
 # search's SAME_POSE_M, because the body is an average one that is not fitted yet. Half and twice the value change no
 # mean error of dance and cube (50 frames).
@@ -168,7 +170,8 @@ def _find(finder: ContourFinder, frame: Observation, pyramid: Pyramid) -> tuple[
 
     starts = gait.hypotheses(skeleton, HEADINGS, PHASES, p_centroid)
     if pyramid.landmarks is not None:
-        starts = np.concatenate([starts, propose(finder.views.rig, skeleton, pyramid.landmarks)])
+        sighted = propose(finder.views.rig, finder.body, pyramid.landmarks, p_centroid)
+        starts = np.concatenate([starts, sighted[:SIGHTED]])
     coarse, turned = ordered(starts, levels[:1])
     kept = [poses[: -(-len(poses) // REFINED)] for poses in (coarse[~turned], coarse[turned])]
     order, turned = ordered(np.concatenate(kept), levels[1:])

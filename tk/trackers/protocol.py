@@ -41,6 +41,7 @@ class Frame:
         sources: (C,) uint8, where a segmenter's masks come from, see :mod:`tk.run.learned_masks`; None for others.
         landmarks: (N, C, L, 3) x, y, pixels, and visibility of the landmarks of N people in view, see
             :mod:`tk.model.cues.landmarks`; NaN where they are unknown. None if no network saw this frame.
+        people: (C, H, W) uint8, bit n: by the network, the pixel shows person n of ``landmarks``. None too.
     """
 
     index: int
@@ -50,6 +51,7 @@ class Frame:
     time: float = 0.0
     sources: NDArray[np.uint8] | None = None
     landmarks: NDArray[np.float64] | None = None
+    people: NDArray[np.uint8] | None = None
 
 
 Observation = Frame  # its former name, in modules that are changed at the moment
@@ -182,6 +184,11 @@ class SharingTracker(Tracker, Protocol):
 
     choice: RayGrid
     screen: RayGrid
+
+    def sighted(self, landmarks: Float) -> RenderedBody | None:
+        """Return an average body on the grid :attr:`choice`, at the pose that a person's landmarks (C, L, 3) show; None
+        if no two images agree on them."""
+        ...
 
     def rendered(self, ahead: bool) -> RenderedBody:
         """Return the body on the grid, with its colours: at the last pose, or at the one expected in the next frame."""

@@ -210,7 +210,7 @@ class RegionTracker(ContourTracker[RegionState]):
         deviation = STATURE_DEVIATION if height_m else STATURE
         trackers = self.with_cameras(self.rig), self.with_cameras(self.rig)
         for tracker, fitted in zip(trackers, both.swapaxes(0, 1), strict=True):
-            tracker.take_body(self.fit(seen, fitted, np.arange(len(seen)), stature, deviation)[0])
+            tracker.take_body(self.fit(seen, fitted, np.arange(len(seen)), stature, deviation).body)
         return trackers
 
     def step(self, frame: Observation) -> Estimate:
@@ -393,7 +393,7 @@ class RegionTracker(ContourTracker[RegionState]):
         best, further = self._best, np.empty((0, len(self._best.pose)))
         if pyramid.landmarks is not None:
             self._heading_known = True
-            further = propose(self.views.rig, self.body.skeleton, pyramid.landmarks)
+            further = propose(self.views.rig, self.body, pyramid.landmarks, best.pose[:3])[:1]
         if misplaced is None and not len(further):
             return
         poses, cost = self.search(frame, pyramid, evidence, best.pose, images, misplaced, further)
