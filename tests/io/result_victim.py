@@ -30,6 +30,7 @@ META = ResultMeta(
     residual_cameras=("cam1", "cam2", "cam3"),
     landmark_names=("nose", "toe_r"),
     mask_sources=("scene", "segmenter"),
+    reasons=("0: nothing", "1: a loss"),
     segment_names=("torso", "head"),
     feet=True,
     angles=(

@@ -24,6 +24,7 @@ from tk.model.cameras.common_view import LEAST_INFORMATION, depth_information
 from tk.model.masks.mask_agreement import Agreement
 from tk.model.setup import Subject
 from tk.trackers.camera_monitor import CameraMonitor, MonitorState, opening_agreement
+from tk.trackers.judgement import report_frames
 from tk.trackers.protocol import Estimate, Observation
 from tk.trackers.region import RegionTracker
 
@@ -58,6 +59,12 @@ class Scene:
         monitor = self.monitor()
         steps = [monitor.step(spoil(frame)) for frame in self.frames]
         return monitor, [e for e, _ in steps], [used.masks.any(axis=(1, 2)) for _, used in steps]
+
+    def lines(self, estimates: list[Estimate]) -> list[str]:
+        """What the user reads about frames."""
+        lines: list[str] = []
+        report_frames(range(len(estimates)), [e.reason for e in estimates], lines.append)
+        return lines
 
     def error(self, estimates: list[Estimate], frames: range) -> float:
         return max(float(np.linalg.norm(estimates[i].joints - self.truth[i], axis=1).mean()) for i in frames)
@@ -191,7 +198,8 @@ def test_absent_person_is_lost_and_recovered_on_return(scene: Scene, cameras: li
     assert all(e.sigma is not None and np.isnan(e.sigma).all() for e in estimates[5:8])
     found = range(status.index("recovered"), FRAMES)
     assert scene.error(estimates, found) < 0.10
-    assert "fewer than two cameras see anybody: no pose, frames 5 to 7" in monitor.report()
+    assert scene.lines(estimates)[0] == "fewer than two cameras see anybody: no pose, frames 5 to 7"
+    assert monitor.doubted.all()
 
 
 def test_person_who_is_elsewhere_without_having_been_lost_is_reported(
@@ -205,8 +213,8 @@ def test_person_who_is_elsewhere_without_having_been_lost_is_reported(
 
     monkeypatch.setattr(RegionTracker, "step", jump)
     expected = "elsewhere than in the frame before, as after a cut in the recording: searched for again, frame 7"
-    assert [expected in line for line in scene.follow(lambda frame: frame)[0].report()] == [True]
-    after_a_loss = scene.follow(blind([0, 1, 2, 3], range(5, 7)))[0].report()
+    assert [expected in line for line in scene.lines(scene.follow(lambda frame: frame)[1])] == [True]
+    after_a_loss = scene.lines(scene.follow(blind([0, 1, 2, 3], range(5, 7)))[1])
     assert after_a_loss and not any("as after a cut" in line for line in after_a_loss)
 
 
@@ -318,7 +326,7 @@ def test_impossible_pose_is_lost(scene: Scene) -> None:
     estimates = [monitor.step(frame)[0] for frame in scene.frames[:6]]
     assert [e.status for e in estimates] == ["tracked"] * 3 + ["lost"] + ["tracked"] * 2
     assert estimates[3].sigma is not None and np.isnan(estimates[3].sigma).all()
-    assert monitor.report() == ["the pose found cannot be true: it jumps: lost, frame 3"]
+    assert scene.lines(estimates) == ["the pose found cannot be true: it jumps: lost, frame 3"]
     assert monitor.doubted.all()
 
 

@@ -293,6 +293,7 @@ def _row(estimate: Estimate, store_hull: bool) -> dict[str, ArrayLike]:
         "residual": estimate.residual,
         "mask_source": estimate.mask_source,
         "landmarks": estimate.landmarks,
+        "evidence/reason": estimate.reason,
         "status": int(Status[estimate.status.upper()]),
         "objective": estimate.objective,
         "iterations": estimate.iterations,

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
+from tk.io.results.status import Status
 from tk.kernels.mask_values import OTHERS
 from tk.model.body.joint_sigma import VIEW_M
 from tk.model.body.plausibility import LastAccepted, Plausibility, check_extent, check_stature
@@ -26,9 +27,17 @@ from tk.model.masks.image_health import MOVED, HealthState, ImageHealth, describ
 from tk.model.masks.mask_agreement import Agreement, MaskAgreement
 from tk.model.setup import Setup, Subject
 from tk.model.stateful import Stateful
+from tk.trackers.judgement import (
+    CONSEQUENCES,
+    FrameEvidence,
+    Reason,
+    depth_known,
+    is_status,
+    judge_frames,
+    refused,
+)
 from tk.trackers.protocol import Estimate, Frame, Tracker, sharing, shows_person, without_cameras
 from tk.trackers.region import RegionTracker
-from tk.trackers.residual import RATE
 from tk.trackers.residual_judge import JudgeState, ResidualJudge
 
 Float = NDArray[np.float64]
@@ -36,10 +45,7 @@ Float = NDArray[np.float64]
 # Frames of the opening that are compared.
 _OPENING = 5
 # Reasons, as in messages.
-_DISAGREES, _TOO_FEW = "disagrees with the others", "fewer than two cameras see anybody"
-_MISSING = "misses a part of the person"
-_IMPLAUSIBLE = "the pose found cannot be true"
-_JUMPED = "the person is elsewhere than in the frame before, as after a cut in the recording"
+_DISAGREES, _MISSING = "disagrees with the others", "misses a part of the person"
 
 Span = tuple[int, int, int]
 """Frames: the first, the last, and their number."""
@@ -72,7 +78,8 @@ class MonitorState:
         refused: poses refused since the last accepted one, because of their residual.
         was_lost: whether the last frame has no pose.
         spans: of exclusion, by "camera/reason".
-        lost: losses and jumps, by reason.
+        doubted: (C,) see :class:`CameraMonitor`.
+        recent: what the last frames show.
         opening_reasons: why cameras are excluded from the opening on.
         health, plausibility, judge: the parts; None without a judge.
     """
@@ -81,7 +88,8 @@ class MonitorState:
     refused: int
     was_lost: bool
     spans: dict[str, Span]
-    lost: dict[str, Span]
+    doubted: NDArray[np.bool_]
+    recent: FrameEvidence
     opening_reasons: dict[int, str]
     health: HealthState
     plausibility: LastAccepted
@@ -95,6 +103,11 @@ class CameraMonitor(Stateful[MonitorState]):
         tracker: the caller starts it with the frames of :meth:`start`, or restores it.
         setup: rig, working volume, upward direction and rate.
         subject: what is known of the person.
+
+    Attributes:
+        unfit: (C,) cameras that their image excludes from the last frame.
+        doubted: (C,) cameras whose images may be the cause of a fault: those that were left out, which the others
+            contradicted; all of them if the person was lost, or jumped.
     """
 
     State = MonitorState
@@ -105,11 +118,11 @@ class CameraMonitor(Stateful[MonitorState]):
         self._health = ImageHealth()
         self._plausibility = Plausibility(setup.fps)
         C = len(self._names)
-        self.unfit = np.zeros(C, bool)  # cameras that their image excludes from the last frame
+        self.unfit, self.doubted = np.zeros(C, bool), np.zeros(C, bool)
         self._excluded = np.zeros(C, bool)
         self._judge = ResidualJudge(tracker, setup.rig) if isinstance(tracker, RegionTracker) else None
         self._spans: dict[str, Span] = {}
-        self._lost: dict[str, Span] = {}
+        self._recent = FrameEvidence.none(C)
         self._opening_reasons: dict[int, str] = {}
         self._refused = 0
         self._was_lost = False
@@ -178,71 +191,73 @@ class CameraMonitor(Stateful[MonitorState]):
             torn = self._judge is not None and self._judge.torn[camera]
             reason = _MISSING if torn else _DISAGREES
             _count(self._spans, f"{camera}/{reason}", frame.index)
-        if estimate.status == "recovered" and not self._was_lost:
-            _count(self._lost, _JUMPED, frame.index)
-        estimate = self._plausible(frame.index, estimate, used)
-        self._was_lost = estimate.status == "lost"
-        if self._judge is not None and estimate.status != "lost" and self._judge.contradicts(estimate):
-            estimate = replace(estimate, status="suspect")
-        return estimate, used
+        self.doubted |= out | self._excluded
+        return self._judged(frame.index, estimate, used), used
+
+    def _judged(self, index: int, estimate: Estimate, used: Frame) -> Estimate:
+        """Return the estimate of a frame with the status and the sigma that follow from its reason."""
+        found = self._found(index, estimate, used)
+        if is_status(np.array(found), Status.LOST):
+            self._plausibility.forget()
+            if estimate.status != "lost" and (tracker := sharing(self.tracker)) is not None:
+                tracker.lose()
+            reason = found
+        else:
+            residual = np.full((len(self._names), 2), np.nan) if estimate.residual is None else estimate.residual
+            depth = bool(depth_known(self._setup.rig, estimate.joints, estimate.residual))
+            self._recent = self._recent.then(found, residual, depth)
+            reason = Reason(judge_frames(self._recent, self._false_alarm)[-1])
+        then = CONSEQUENCES[reason]
+        status = estimate.status if then.status is None else then.status.name.lower()
+        self._was_lost = status == "lost"
+        self.doubted |= self._was_lost or found == Reason.CUT
+        unknown = estimate.sigma is not None and not then.sigma
+        sigma = np.full(len(JOINTS), np.nan) if unknown else estimate.sigma
+        return replace(estimate, status=status, reason=int(reason), sigma=sigma)
+
+    def _found(self, index: int, estimate: Estimate, used: Frame) -> Reason:
+        """Return the reason that a frame itself shows."""
+        if estimate.status == "lost":
+            return Reason.UNEXPLAINED if shows_person(used.masks).any() else Reason.NOBODY
+        recovered = estimate.status == "recovered"
+        if recovered:  # the person may be elsewhere, as after a cut
+            self._plausibility.forget()
+        reason = self._plausibility.judge(index, estimate.joints)
+        if reason is None and recovered and refused(self._excess, self._refused, self._false_alarm):
+            self._refused += 1
+            return Reason.STILL_HIGH
+        if reason is not None:
+            return Reason[reason]
+        self._refused = 0
+        if recovered and not self._was_lost:
+            return Reason.CUT
+        if estimate.sigma is not None and np.isnan(estimate.sigma).all():
+            return Reason.HIGH
+        return Reason.NONE
+
+    @property
+    def _false_alarm(self) -> float:
+        """See :func:`judge_frames`; only region trackers have residuals."""
+        return self.tracker.config.false_alarm if isinstance(self.tracker, RegionTracker) else 0.5
 
     def _bad(self, unhealthy: Sequence[str | None]) -> NDArray[np.bool_]:
         """Return (C,) the cameras whose image excludes them. Trackers of hulls need all cameras."""
         return np.array([self.tracker.can_exclude_cameras and reason is not None for reason in unhealthy])
-
-    def _plausible(self, index: int, estimate: Estimate, used: Frame) -> Estimate:
-        """Return the estimate, with status lost if it is impossible."""
-        if estimate.status == "lost":
-            self._plausibility.forget()
-            if not shows_person(used.masks).any():
-                _count(self._lost, _TOO_FEW, index)
-            return estimate
-        if estimate.status == "recovered":  # the person may be elsewhere, as after a cut
-            self._plausibility.forget()
-        reason = self._plausibility.judge(index, estimate.joints)
-        if reason is None and estimate.status == "recovered" and self._excess > self._accepted:
-            reason = "after a loss its residual is still high"
-            self._refused += 1
-        if reason is None:
-            self._refused = 0
-            return estimate
-        _count(self._lost, f"{_IMPLAUSIBLE}: {reason}", index)
-        self._plausibility.forget()
-        if (tracker := sharing(self.tracker)) is not None:
-            tracker.lose()
-        return replace(estimate, status="lost", sigma=None if estimate.sigma is None else np.full(len(JOINTS), np.nan))
-
-    @property
-    def _accepted(self) -> float:
-        """The largest excess of a pose after a loss: one spread, because no prediction supports such a pose. After the
-        frames in which a baseline follows a change (1 / RATE), the level itself may have changed, and only an abnormal
-        residual refuses a pose. With twice the limit, a mirrored pose was accepted for 12 frames (fault "away")."""
-        return self._judge.normal if self._judge is not None and self._refused >= 1 / RATE else 1.0
 
     @property
     def moved(self) -> NDArray[np.bool_]:
         """(C,) the cameras that have been moved since the first frame."""
         return np.array([f"{camera}/{MOVED}" in self._spans for camera in range(len(self._names))])
 
-    @property
-    def doubted(self) -> NDArray[np.bool_]:
-        """(C,) the cameras whose images may be the cause of a line of :meth:`report`: those that were left out, which
-        the others contradicted; all of them if the person was lost, or jumped."""
-        left_out = {int(key.partition("/")[0]) for key in self._spans}
-        return np.array([bool(self._lost) or camera in left_out for camera in range(len(self._names))])
-
     def report(self) -> list[str]:
-        """Return a line for each camera and reason of exclusion, and for each reason of a loss."""
+        """Return a line for each camera and reason of exclusion."""
         lines = []
         for key, span in sorted(self._spans.items()):
             camera, _, reason = key.partition("/")
             because = self._opening_reasons.get(int(camera)) if reason == _DISAGREES else None
             more = f" ({because})" if because else ""
             lines.append(f"camera {self._names[int(camera)]} {reason}{more}: left out of {described(*span)}")
-        # without two views the person may also be absent, which the monitor does not know
-        outcome = {_TOO_FEW: "no pose", _JUMPED: "searched for again"}
-        status = {reason: outcome.get(reason, "lost") for reason in self._lost}
-        return lines + [f"{reason}: {status[reason]}, {described(*span)}" for reason, span in self._lost.items()]
+        return lines
 
 
 def _count(spans: dict[str, Span], key: str, index: int) -> None:

@@ -64,6 +64,7 @@ class Estimate:
         joints: (J, 3) joint centres, metres. Pose and joints are NaN before anybody is tracked.
         status: "tracked", "initialised", "recovered", "lost", "suspect" (by the camera monitor), or "absent" (by the
             run: nobody is there).
+        reason: why it is lost, suspect or without sigma: a :class:`~tk.trackers.judgement.Reason`, 0 if it is not.
         objective: the objective's final value; of contour trackers E_S, mean over the views.
         iterations: (S,) optimiser iterations by stage; for ``search`` 1 if limbs were searched, else 0.
         timing: seconds by stage.
@@ -94,6 +95,7 @@ class Estimate:
     drawn: NDArray[np.bool_] | None = None
     mask_source: NDArray[np.uint8] | None = None
     landmarks: Float | None = None
+    reason: int = 0
     frame: int = -1
     time: float = 0.0
     person: int = 0

@@ -39,8 +39,6 @@ OUTLIER = 5.0
 # 0.126 in the median of a recording, at most 0.20 over RECENT frames. Another recording's calibration gives 0.25 to
 # 0.6; two of five cameras turned by 3 degrees give 0.15 to 0.6.
 LEVEL, LEVEL_SPREAD, RECENT = 0.091, 0.264, 5
-# Keeps the logarithm finite where a body fits perfectly; a hundredth of the level.
-_TINY = 1e-3
 
 
 def displacements(residual: Float) -> Float:
@@ -64,25 +62,6 @@ def variance_factor(residual: Float) -> Float:
     to the expected one (Förstner and Wrobel, *Photogrammetric Computer Vision*, 2016, section 4.2.3).
     """
     return np.asarray(np.fmax(displacement(residual) / LEVEL, 1.0) ** 2)
-
-
-def contradicted(residual: Float, false_alarm: float) -> NDArray[np.bool_]:
-    """Return (F,) whether residuals (F, V, 2) of consecutive frames contradict the poses: the frame is among
-    :data:`RECENT` ones whose mean displacement is far above :data:`LEVEL`.
-
-    Half of the logarithm's variance lies between recordings, so all frames of a recording with a high level would count
-    as contradicted. The limit is therefore set for the probability ``false_alarm`` squared.
-    """
-    log = np.log(displacement(residual) + _TINY)
-    measured = np.flatnonzero(np.isfinite(log))
-    result = np.zeros(len(residual), np.bool_)
-    if len(measured):
-        window = min(RECENT, len(measured))
-        mean = np.convolve(log[measured], np.full(window, 1.0 / window), "valid")
-        limit = np.log(LEVEL) - LEVEL_SPREAD * NormalDist().inv_cdf(false_alarm**2)
-        for first in np.flatnonzero(mean > limit):
-            result[measured[first : first + window]] = True
-    return result
 
 
 @dataclass(frozen=True)

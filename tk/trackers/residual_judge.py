@@ -25,7 +25,7 @@ from tk.model.cues.ray_costs import residual_of
 from tk.model.stateful import Stateful
 from tk.trackers.protocol import Estimate, Frame, shows_person, without_cameras
 from tk.trackers.region import RegionTracker
-from tk.trackers.residual import OUTLIER, RECENT, contradicted
+from tk.trackers.residual import OUTLIER
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -51,14 +51,12 @@ class JudgeState:
         normal_for: (C,) consecutive frames with a normal residual.
         since_test: (C,) frames since the last test.
         at_test: (C,) excess at the last test.
-        recent: (RECENT, C, 2) residuals of the last frames.
     """
 
     torn: Bool
     normal_for: NDArray[np.int64]
     since_test: NDArray[np.int64]
     at_test: Float
-    recent: Float
 
 
 class ResidualJudge(Stateful[JudgeState]):
@@ -81,7 +79,6 @@ class ResidualJudge(Stateful[JudgeState]):
         self._normal_for = np.zeros(C, np.int64)
         self._since_test = np.full(C, _PAUSE)
         self._at_test = np.zeros(C)
-        self._recent = np.full((RECENT, C, 2), np.nan)
 
     def step(self, frame: Frame, used: Frame, bad: Bool, excluded: Bool) -> tuple[Estimate, Frame, float]:
         """Step the tracker; exclude a camera that is wrong, and include those again that are right.
@@ -179,10 +176,3 @@ class ResidualJudge(Stateful[JudgeState]):
     def normal(self) -> float:
         """The excess below which a residual is normal again: halfway between a high one and an outlier."""
         return (self.tracker.residuals.threshold + OUTLIER) / 2
-
-    def contradicts(self, estimate: Estimate) -> bool:
-        """Return whether the residuals of the last frames contradict the estimate of this frame."""
-        if estimate.residual is None:
-            return False
-        self._recent = np.concatenate([self._recent[1:], estimate.residual[None]])
-        return bool(contradicted(self._recent, self.tracker.config.false_alarm)[-1])

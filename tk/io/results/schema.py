@@ -136,6 +136,10 @@ ROWS = (
         "visibility; NaN where the network was not asked",
         {"names": "landmark_names", "cameras": "residual_cameras"}, field="landmarks", optional="landmark_names",
     ),
+    Dataset(
+        "evidence/reason", "F", "uint8", "why the frame is lost, suspect or without sigma",
+        {"meaning": "reasons"}, field="reason", optional="reasons",
+    ),
     Dataset("iterations", "F T", "int32", "optimiser iterations by stage", {"stages": "stages"}, field="iterations"),
     Dataset(
         "timing/<stage>", "F", "float64", "seconds by stage; `total` is the frame's share of the wall time",
