@@ -31,6 +31,7 @@ META = ResultMeta(
     landmark_names=("nose", "toe_r"),
     mask_sources=("scene", "segmenter"),
     reasons=("0: nothing", "1: a loss"),
+    camera_states=("0: used", "1: torn"),
     segment_names=("torso", "head"),
     feet=True,
     angles=(

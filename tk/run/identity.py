@@ -185,4 +185,5 @@ def _with_rows(to: Result, rows: NDArray[np.int64], source: Result, other: NDArr
 COLUMNS = {
     "pose": "pose", "joints/position": "joints", "joints/sigma": "sigma", "residual": "residual", "status": "status",
     "objective": "objective", "landmarks": "landmarks", "evidence/reason": "reason",
+    "evidence/camera": "camera_state",
 }  # fmt: skip

@@ -294,6 +294,8 @@ def _row(estimate: Estimate, store_hull: bool) -> dict[str, ArrayLike]:
         "mask_source": estimate.mask_source,
         "landmarks": estimate.landmarks,
         "evidence/reason": estimate.reason,
+        "evidence/camera": estimate.cameras if estimate.residual is not None else None,
+        "evidence/shift": estimate.shift if estimate.residual is not None else None,
         "status": int(Status[estimate.status.upper()]),
         "objective": estimate.objective,
         "iterations": estimate.iterations,

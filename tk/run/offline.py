@@ -30,6 +30,7 @@ from tk.trackers.judgement import (
     FrameEvidence,
     Reason,
     depth_known,
+    first_reason,
     is_status,
     judge_frames,
     report_frames,
@@ -128,12 +129,14 @@ class _Draft:
 
     def replace(self, rows: NDArray[np.int64], estimates: Sequence[Estimate]) -> None:
         """Take other estimates for some frames; the first frame's status stays "initialised"."""
-        datasets = ("pose", "joints/sigma", "residual", "objective", "status", "evidence/reason")
+        datasets = ("pose", "joints/sigma", "residual", "objective", "status", "evidence/reason", "evidence/camera")
         columns = {dataset: self.current(dataset).copy() for dataset in datasets}
         for row, e in zip(rows, estimates, strict=True):
             columns["pose"][row], columns["objective"][row] = e.pose, e.objective
             columns["joints/sigma"][row], columns["residual"][row] = e.sigma, e.residual
             columns["evidence/reason"][row] = e.reason
+            if e.cameras is not None:  # else those of the first pass were left out
+                columns["evidence/camera"][row] = e.cameras
             if columns["status"][row] != Status.INITIALISED:
                 columns["status"][row] = Status[e.status.upper()]
             self.lost[row] = e.status == "lost"
@@ -263,7 +266,9 @@ class _Finisher:
                 if frame.index in rows:
                     used = without_cameras(frame, unused[rows[frame.index]])
                     for tracker, estimates in zip(trackers, found, strict=True):
-                        estimates.append(replace(tracker.step(used), masks=None, drawn=None))  # these are large
+                        found_one = tracker.step(used)
+                        reason = int(first_reason(found_one.status, found_one.sigma))
+                        estimates.append(replace(found_one, reason=reason, masks=None, drawn=None))  # these are large
                     self.within(len(found[0]) / len(rows))
         drafts = [replace(draft, lost=draft.lost.copy(), columns=dict(draft.columns)) for _ in trackers]
         for one, estimates in zip(drafts, found, strict=True):

@@ -1,6 +1,18 @@
-"""When a frame is lost, suspect or without sigma: the reasons, their messages, and the decision.
+"""One account of the evidence: when a camera is left out, and when a frame is lost, suspect or without sigma.
 
-What a frame itself shows (nobody, an impossible pose, a residual that stays high) is its first reason.
+**Cameras.** A camera is right, or it has one of :data:`FAULTS`. Evidence of its image
+(:mod:`tk.model.masks.image_health`) is certain, and counts for one frame. Evidence of its mask is the missing and the
+surplus area, as excess above the camera's baseline, in spreads. Three states explain it:
+
+- right: both areas are normal; surplus area may be somebody or something else in the mask.
+- torn: in a part of the frames any part of the mask is missing; surplus area as of a right camera.
+- wrong: any missing and any surplus area. A camera that is turned, moved or late has both.
+
+A wrong pose explains a high residual, too. So the evidence of one frame is a comparison of explanations: the person is
+tracked with the camera and without it (:meth:`Cameras.judge`). A camera that is left out is weighed in each frame at
+the pose that the others give, by forward probabilities (Rabiner, *Proceedings of the IEEE*, 1989).
+
+**Frames.** What a frame itself shows (nobody, an impossible pose, a residual that stays high) is its first reason.
 :func:`judge_frames` adds what several frames show together: body and masks differ more than in a correct recording, or
 the cameras do not determine depth. A run asks it in each frame with the last frames, and at its end with all of them.
 """
@@ -18,7 +30,8 @@ from numpy.typing import NDArray
 from tk.io.results.status import Status
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import determine_depth
-from tk.model.masks.image_health import described
+from tk.model.masks.image_health import BLANK, FROZEN, MOVED, described
+from tk.model.stateful import Stateful
 from tk.trackers.residual import LEVEL, LEVEL_SPREAD, OUTLIER, RATE, RECENT, displacement
 
 Float = NDArray[np.float64]
@@ -28,6 +41,137 @@ Bool = NDArray[np.bool_]
 _TINY = 1e-3
 # Sigma is unknown after this many consecutive frames with a high residual, and two failed searches for the person.
 UNKNOWN_AFTER = 6
+
+
+WRONG, TORN = "wrong", "torn"
+#: faults of a camera, as messages name them; a further kind of evidence has its line here
+FAULTS = {
+    WRONG: "disagrees with the others",
+    TORN: "misses a part of the person",
+    BLANK: "shows nothing",
+    FROZEN: "stands still",
+    MOVED: "has been moved since the first frame",
+}
+STATES = ("used", *FAULTS)
+#: meaning of each value of `/evidence/camera`
+STATE_MEANINGS = tuple(f"{value}: {FAULTS.get(state, state)}" for value, state in enumerate(STATES))
+
+# Faults of a camera a second: each kind begins once in eleven minutes, and lasts five seconds.
+_BEGIN_HZ, _END_HZ = 0.0015, 0.2
+# Least probability of a state.
+_LEAST = 1e-9
+# Wrong poses a second, whatever the cameras are.
+_LOSE_HZ = 0.3
+# Share of the frames in which a torn mask is whole; probability that a right mask shows something else, too.
+_WHOLE, _FOREIGN = 0.5, 1e-4
+
+
+def likelihoods(excess: Float, spread: Float) -> Float:
+    """Return (C, 3) logarithms of the likelihoods of the states right, wrong and torn; 0 if the excess is unknown.
+
+    Args:
+        excess: (C, 2) of missing and surplus area, in spreads.
+        spread: (C,) of the areas, shares of the person's pixels: if a mask shows anything, all areas between 0 and 1
+            are equally likely.
+    """
+    normal = -(np.fmax(excess, 0.0) ** 2) / 2 - np.log(2 * np.pi) / 2
+    anything = np.log(spread)
+    surplus = np.logaddexp(np.log1p(-_FOREIGN) + normal[:, 1], np.log(_FOREIGN) + anything)
+    torn = np.logaddexp(np.log(_WHOLE) + normal[:, 0], np.log1p(-_WHOLE) + anything)
+    found = np.stack([normal[:, 0] + surplus, 2 * anything, torn + surplus], axis=1)
+    return np.where(np.isfinite(excess[:, :1]), found, 0.0)
+
+
+@dataclass(frozen=True)
+class Belief:
+    """(C, S) the probability of each of :data:`STATES` of each camera."""
+
+    probability: Float
+
+
+class Cameras(Stateful[Belief]):
+    """The states of C cameras, in frames at a rate of ``fps``."""
+
+    State = Belief
+
+    def __init__(self, count: int, fps: float) -> None:
+        self._probability = np.zeros((count, len(STATES)))
+        self._probability[:, 0] = 1.0
+        self._fps = fps
+        begin = _BEGIN_HZ / fps
+        self._prior = np.log([1 - 2 * begin, begin, begin])
+
+    @property
+    def states(self) -> NDArray[np.uint8]:
+        """(C,) index of each camera's state in :data:`STATES`; 0 unless a fault is likelier than none."""
+        faults = 1 + self._probability[:, 1:].argmax(axis=1)
+        return np.where(self._probability[:, 0] < 0.5, faults, 0).astype(np.uint8)
+
+    @property
+    def unfit(self) -> Bool:
+        """(C,) cameras whose image shows that they cannot be used."""
+        return self.states > STATES.index(TORN)
+
+    def be(self, camera: int, state: str) -> None:
+        """Take a camera's state for certain."""
+        self._probability[camera] = np.arange(len(STATES)) == STATES.index(state)
+
+    def look(self, faults: Sequence[str | None]) -> None:
+        """Take in the faults of the images of the next frame; None for an image without one."""
+        for camera, (fault, was) in enumerate(zip(faults, self.unfit, strict=True)):
+            if fault is not None or was:
+                self.be(camera, fault or "used")
+
+    def weigh(self, cameras: Bool, likelihood: Float) -> None:
+        """Weigh cameras (C,) that are left out, by the likelihoods (C, 3) of their residual at the others' pose."""
+        end = min(_END_HZ / self._fps, 0.5)
+        begin = np.exp(self._prior)
+        for camera in np.flatnonzero(cameras):
+            right, wrong, torn = np.maximum(self._probability[camera, :3], _LEAST)
+            before = right * begin + np.array([(wrong + torn) * end, wrong * (1 - end), torn * (1 - end)])
+            self._probability[camera, :3] = _normalised(np.log(before) + likelihood[camera])
+
+    def suspect(self, likelihood: Float, best: Float, kept: Bool) -> int | None:
+        """Return which of the cameras used, ``kept`` (C,), is to be judged; None if none is.
+
+        Its residual must speak against it; and with what the others can gain without it at most, a fault must be
+        likelier than none.
+
+        Args:
+            likelihood: (C, 3) at the pose of all of them.
+            best: (C, 3) of residuals without an excess.
+        """
+        against = np.where(kept, likelihood[:, 1:].max(axis=1) - likelihood[:, 0], -np.inf)
+        camera = int(np.argmax(against))
+        others = kept & (np.arange(len(kept)) != camera)
+        gain = self._marginal(best[others]) - self._marginal(likelihood[others])
+        return camera if against[camera] > 0 and against[camera] + self._prior[1] + gain > 0 else None
+
+    def judge(self, camera: int, others: Bool, with_it: Float, without: Float) -> bool:
+        """Return whether a camera has a fault, from the likelihoods (C, 3) at the poses with it and without it.
+
+        Four explanations are compared: the camera is right, wrong or torn; or the pose is wrong, so that all residuals
+        may be anything. ``others``: (C,) the other cameras used.
+        """
+        right = self._prior[0] + with_it[camera, 0] + self._marginal(with_it[others])
+        lost = np.log(_LOSE_HZ / self._fps) + with_it[camera, 1] + with_it[others, 1].sum()
+        faults = self._prior[1:] + without[camera, 1:] + self._marginal(without[others])
+        probability = _normalised(np.array([np.logaddexp(right, lost), *faults]))
+        found = bool(probability[0] < 0.5)
+        if found:
+            self.be(camera, WRONG)
+            self._probability[camera, :3] = probability
+        return found
+
+    def _marginal(self, likelihood: Float) -> float:
+        """Return the logarithm of the likelihood of N cameras in unknown states, from those (N, 3) of each state."""
+        return float(np.logaddexp.reduce(self._prior + likelihood, axis=1).sum())
+
+
+def _normalised(nats: Float) -> Float:
+    """Return probabilities that are proportional to exp(nats)."""
+    found = np.exp(nats - nats.max())
+    return np.asarray(found / found.sum())
 
 
 class Reason(IntEnum):
@@ -172,6 +316,13 @@ def _contradicted(residual: Float, false_alarm: float) -> Bool:
         for first in np.flatnonzero(mean > limit):
             result[measured[first : first + window]] = True
     return result
+
+
+def first_reason(status: str, sigma: Float | None, nobody: bool = False) -> Reason:
+    """Return the reason that a tracker's status and sigma (J,) imply. ``nobody``: whether no camera shows anybody."""
+    if status == "lost":
+        return Reason.NOBODY if nobody else Reason.UNEXPLAINED
+    return Reason.HIGH if sigma is not None and np.isnan(sigma).all() else Reason.NONE
 
 
 def refused(excess: float, since: int, false_alarm: float) -> bool:

@@ -78,6 +78,10 @@ class Estimate:
             cameras left out included; None likewise.
         mask_source: (C,) uint8, as ``Frame.sources``.
         landmarks: (C, L, 3) those of this person among ``Frame.landmarks``; None if there are none.
+        cameras: (C,) uint8, which cameras were left out, and why: indices in :data:`~tk.trackers.judgement.STATES`.
+            None before anybody is tracked.
+        shift: (C,) by which share of its longer side each image has moved since the first frame; NaN if unknown. None
+            before anybody is tracked.
         frame, time: the frame's number in the capture, and seconds; whoever steps the tracker knows them.
         person: the person's number in the run.
     """
@@ -96,6 +100,8 @@ class Estimate:
     mask_source: NDArray[np.uint8] | None = None
     landmarks: Float | None = None
     reason: int = 0
+    cameras: NDArray[np.uint8] | None = None
+    shift: Float | None = None
     frame: int = -1
     time: float = 0.0
     person: int = 0

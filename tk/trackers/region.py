@@ -434,7 +434,7 @@ class RegionTracker(ContourTracker[RegionState]):
             return
         if self.config.colors and evidence.bins is not None and self.residuals.mean_excess(look.error) <= 0:
             self.colors.learn(evidence.bins[evidence.person], look.label[evidence.person])
-        self.residuals.learn(look.error)
+        self.residuals.learn(look.residual)
 
     def _look(self, evidence: Evidence, pyramid: Pyramid, images: NDArray[np.uint8] | None) -> _Look:
         """Return how the best pose explains the frame."""
