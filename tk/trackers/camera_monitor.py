@@ -223,11 +223,13 @@ class CameraMonitor(Stateful[MonitorState]):
         if suspect is not None:
             others = kept & (np.arange(len(kept)) != suspect)
             if determine_depth(self._setup.rig.centers, estimate.joints.mean(axis=0), others):
-                with_it, after, fewer = _likelihoods(tracker, residual), tracker.state, without_cameras(used, ~others)
+                after, fewer = tracker.state, without_cameras(used, ~others)
                 tracker.state = before
                 second = tracker.step(fewer)
                 again = self._residual(tracker, frame, second)
-                if cameras.judge(suspect, others, with_it, _likelihoods(tracker, again)):
+                # both poses by a baseline that has not learned this frame from the camera
+                with_it, without = (_likelihoods(tracker, found) for found in (residual, again))
+                if cameras.judge(suspect, others, with_it, without):
                     estimate, used = replace(second, status=estimate.status), fewer
                     kept, residual = others, again
                 else:
