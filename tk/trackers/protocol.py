@@ -66,6 +66,7 @@ class Estimate:
         joints: (J, 3) joint centres, metres. Pose and joints are NaN before anybody is tracked.
         status: "tracked", "initialised", "recovered", "lost", "suspect" (by the camera monitor), or "absent" (by the
             run: nobody is there).
+        reason: why it is lost, suspect or without sigma: a :class:`~tk.trackers.judgement.Reason`, 0 if it is not.
         objective: the objective's final value; of contour trackers E_S, mean over the views.
         iterations: (S,) optimiser iterations by stage; for ``search`` 1 if limbs were searched, else 0.
         timing: seconds by stage.
@@ -79,6 +80,10 @@ class Estimate:
             cameras left out included; None likewise.
         mask_source: (C,) uint8, as ``Frame.sources``.
         landmarks: (C, L, 3) those of this person among ``Frame.landmarks``; None if there are none.
+        cameras: (C,) uint8, which cameras were left out, and why: indices in :data:`~tk.trackers.judgement.STATES`.
+            None before anybody is tracked.
+        shift: (C,) by which share of its longer side each image has moved since the first frame; NaN if unknown. None
+            before anybody is tracked.
         frame, time: the frame's number in the capture, and seconds; whoever steps the tracker knows them.
         person: the person's number in the run.
     """
@@ -96,6 +101,9 @@ class Estimate:
     drawn: NDArray[np.bool_] | None = None
     mask_source: NDArray[np.uint8] | None = None
     landmarks: Float | None = None
+    reason: int = 0
+    cameras: NDArray[np.uint8] | None = None
+    shift: Float | None = None
     frame: int = -1
     time: float = 0.0
     person: int = 0

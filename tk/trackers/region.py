@@ -46,6 +46,7 @@ from tk.settings import RegionSettings, Settings, SilhouetteSettings
 from tk.trackers.contour_finder import INFORMATION
 from tk.trackers.contour_tracker import RECOVER_EVERY, ContourTracker
 from tk.trackers.hypotheses import DROPPED, PATIENCE, RENEWAL, Hypothesis, disagreement
+from tk.trackers.judgement import UNKNOWN_AFTER
 from tk.trackers.limb_search import SAME_POSE_M
 from tk.trackers.protocol import Estimate, Observation, Stopwatch
 from tk.trackers.residual import BaselineState, ResidualBaseline, variance_factor
@@ -72,8 +73,6 @@ ANGLE_DEG, TRANSLATION_M = 40.0, 0.3
 # fold, cube, punch and kick with all, three and two cameras it is 1.67 to 2.4 in the median of 20 frames; of small
 # pictures of a walk of 14 frames 1.21; of a person with poor masks 1.05, and 1.00 or less if back was taken for front.
 AMBIGUOUS_HEADING = 1.15
-# After this many consecutive frames with a high residual, and two failed searches for the person, sigma is set to NaN.
-UNKNOWN_AFTER = 2 * RECOVER_EVERY
 # Masks are searched for carried objects if this share of their pixels has colours that are not the person's; objects
 # narrower than six pixels are ignored.
 FOREIGN_SHARE = 0.01
@@ -435,7 +434,7 @@ class RegionTracker(ContourTracker[RegionState]):
             return
         if self.config.colors and evidence.bins is not None and self.residuals.mean_excess(look.error) <= 0:
             self.colors.learn(evidence.bins[evidence.person], look.label[evidence.person])
-        self.residuals.learn(look.error)
+        self.residuals.learn(look.residual)
 
     def _look(self, evidence: Evidence, pyramid: Pyramid, images: NDArray[np.uint8] | None) -> _Look:
         """Return how the best pose explains the frame."""
