@@ -35,7 +35,8 @@ from tk.io.captures.capture_toml import read_settings
 from tk.io.toml import load_toml
 from tk.model.cameras.camera import Camera, Rig
 from tk.synchronise.raw import read_raw
-from tk.synchronise.run import SOUND_M_S, synchronise
+from tk.synchronise.run import synchronise
+from tk.synchronise.travel import SOUND_M_S
 
 SOUND_HZ = 48000
 
@@ -166,7 +167,7 @@ def _read(path: Path) -> list[np.ndarray]:
     if not path.suffix:
         path = next(path.parent.glob(f"{path.name}.*"))
     if path.suffix == ".png":
-        return [cv2.imread(str(path))]
+        return [np.asarray(cv2.imread(str(path)))]
     frames: list[np.ndarray] = []
     video = cv2.VideoCapture(str(path))
     while True:
@@ -286,7 +287,7 @@ def errors_ms(folder: Path, cameras: Sequence[Camera], way: str) -> tuple[np.nda
         elif c:
             found = first.offset_s + first.rate * done.clocks.common(c, own)
             late = found - true.offset_s - true.rate * own
-            heard = late - (first.way_s - true.way_s) * (way == "sound")
+            heard = late - (first.way_s - true.way_s) * (way == "sound" and not cameras)
             rows.append((late, heard, float(done.clocks.offset_sigma_s[c])))
     return 1000 * np.array(rows).reshape(-1, 3), unsure
 

@@ -120,7 +120,9 @@ def _match(i: int, j: int, one: Sequence[Event], other: Sequence[Event]) -> list
         pairs = []
         for a in one:
             near = min(other, key=lambda b: abs(a.own_s - b.own_s - lag))
-            if abs(a.own_s - near.own_s - lag) < (a.interval_s + near.interval_s) / 2 and np.sign(a.change) == np.sign(near.change):
+            if abs(a.own_s - near.own_s - lag) < (a.interval_s + near.interval_s) / 2 and np.sign(a.change) == np.sign(
+                near.change
+            ):
                 pairs.append((a, near))
         return pairs
 
