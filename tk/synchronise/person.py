@@ -32,7 +32,7 @@ _PLANES, _BEYOND = 48, 0.01
 #: least sine of the angle between a ray and the line through both cameras: beside it, planes are not determined
 _LEAST_SINE = 0.2
 #: highest probability that another lag is the right one. Of 48 cameras whose video showed another recording, it was
-#: above 1e-4 for all; rhythms repeat, so that significances have more large values than normal deviates.
+#: above 5e-4 for all; rhythms repeat, so that significances have more large values than normal deviates.
 _DOUBT = 1e-6
 #: seconds over which signals without known cameras are compared with their surroundings
 _SLOW_S = 1.5
