@@ -141,7 +141,7 @@ def test_turned_camera_is_excluded_and_included_again(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize(
-    ("seen", "wrong"), [("none", True), ("right", False), ("turned", True), ("in two images", True)]
+    ("seen", "wrong"), [("none", True), ("right", False), ("turned", True), ("in two images", False), ("alone", True)]
 )
 def test_landmarks_confirm_a_camera_whose_masks_contradict_the_others(scene: Scene, seen: str, wrong: bool) -> None:
     """The masks of a camera are displaced; its landmarks are right, displaced with the masks, or unknown."""
@@ -150,8 +150,10 @@ def test_landmarks_confirm_a_camera_whose_masks_contradict_the_others(scene: Sce
         landmarks = landmarks_of(scene.setup.rig, BODY, walk(1)[0], 0.02, seed=frame.index)[None]
         if seen == "turned":
             landmarks[:, 1, :, 0] += 40.0
-        if seen == "in two images":
+        if seen in ("in two images", "alone"):
             landmarks[:, 2:] = np.nan
+        if seen == "alone":
+            landmarks[:, 0] = np.nan
         frames.append(replace(frame, landmarks=None if seen == "none" else landmarks))
     assert (1 in opening_agreement(scene.setup, frames).wrong) == wrong
 
