@@ -297,14 +297,15 @@ class People:
         at_first: list[int] = []  # voxels of each hull in the second frame: in the first, all masks carved it
         mixed = [False] * len(people)
         for frame in frames:
-            owners = assign(rig, grid, self._sighted(frame, hulls), frame, UNKNOWN_BY_HULLS)
+            sighted = self._sighted(frame)
+            owners = assign(rig, grid, _in_place(sighted, hulls), frame, UNKNOWN_BY_HULLS)
             if frame is not frames[0]:
                 for k, place in enumerate(places):
                     points, places[k] = finder.around(place, owners.share(frame, k).masks, counts[k])
                     if len(points):
                         counts[k], hulls[k] = len(points), cast_points(rig, grid, points, finder.voxel_m)
                 at_first = at_first or list(counts)
-                owners = assign(rig, grid, self._sighted(frame, hulls), frame, UNKNOWN_BY_HULLS)
+                owners = assign(rig, grid, _in_place(sighted, hulls), frame, UNKNOWN_BY_HULLS)
                 for k, (count, first) in enumerate(zip(counts, at_first, strict=True)):
                     mixed[k] |= not 1 / _MIXED < count / first < _MIXED
             for k, own in enumerate(shares):
@@ -312,16 +313,12 @@ class People:
                     own.append(owners.share(frame, k))
         return shares
 
-    def _sighted(self, frame: Frame, hulls: Sequence[RenderedBody]) -> list[RenderedBody | None]:
-        """Return people's hulls, or in their place the bodies that the landmarks in a frame show: hulls of people who
-        stand close together contain parts of each other."""
-        share, bodies = sharing(self._first), list[RenderedBody | None](hulls)
+    def _sighted(self, frame: Frame) -> list[RenderedBody]:
+        """Return the bodies that the landmarks in a frame show."""
+        share = sharing(self._first)
         if share is None or frame.landmarks is None:
-            return bodies
-        seen = [body for landmarks in frame.landmarks if (body := share.sighted(landmarks)) is not None]
-        for n, k in matched_bodies([body.label > 0 for body in seen], hulls).items():
-            bodies[k] = seen[n]
-        return bodies
+            return []
+        return [body for landmarks in frame.landmarks if (body := share.sighted(landmarks)) is not None]
 
     # --- one frame ----------------------------------------------------------------------------------------------------
 
@@ -545,6 +542,16 @@ class People:
             member.state = person.member
             self._tracked.append(member)
         self._given, self._contacts.all = set(state.given), state.contacts
+
+
+def _in_place(sighted: Sequence[RenderedBody], hulls: Sequence[RenderedBody]) -> list[RenderedBody]:
+    """Return people's hulls, or in their place the bodies that landmarks show: hulls of people who stand close together
+    contain parts of each other."""
+    whose = matched_bodies([body.label > 0 for body in sighted], hulls)
+    bodies = list(hulls)
+    for n, k in whose.items():
+        bodies[k] = sighted[n]
+    return bodies
 
 
 def _not_entered(number: int) -> str:
