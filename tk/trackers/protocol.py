@@ -41,7 +41,8 @@ class Frame:
         sources: (C,) uint8, where a segmenter's masks come from, see :mod:`tk.run.learned_masks`; None for others.
         landmarks: (N, C, L, 3) x, y, pixels, and visibility of the landmarks of N people in view, see
             :mod:`tk.model.cues.landmarks`; NaN where they are unknown. None if no network saw this frame.
-        people: (C, H, W) uint8, bit n: by the network, the pixel shows person n of ``landmarks``. None too.
+        people: (C, H, W) uint8, bit n: the network's mask of person n of ``landmarks`` shows the pixel. None if no
+            network saw this frame.
     """
 
     index: int

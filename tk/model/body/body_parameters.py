@@ -104,7 +104,7 @@ class BodyFamily:
         twists = np.concatenate(s.twists(poses), axis=-1).swapaxes(-1, -2)
         return LinearisedBody(body, s.segment_transforms(poses), twists, by_part.transpose(1, 2, 0), moves)
 
-    def landmark_rows(self, shared: Float, body: ConeBody, pose: Float) -> Float:
+    def landmark_rows(self, shared: Float, pose: Float) -> Float:
         """Return the derivatives (L, 3, K) of the points that landmarks mark by the parameters (K,), at a pose (D,)."""
         return self._rows(shared, lambda d: build_skeleton(d).points(pose, SEGMENT, places(d)))
 
