@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -30,7 +29,8 @@ def fourth(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     told: list[str] = []
     make_raw(folder, told.append, ["cam4"])
     assert told == [f"making {folder / 'cam4'}.mp4"]
-    shutil.copy(folder / "cam4.mp4", folder / "other.mp4")  # a folder of one video is refused
+    # a folder of one video is refused, and so is the same file twice
+    (folder / "other.mp4").write_bytes((folder / "cam4.mp4").read_bytes() + b"\0\0\0\x08free")
     return read_raw(folder)[0]
 
 

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.people import RIG, person_mask, write_people
+from tk.errors import CaptureError
 from tk.io.captures.capture import open_capture
+from tk.model.body.anthropometry import AVERAGE_BODY
+from tk.model.body.cone_body import build_cone_body
+from tk.model.setup import Subject
 from tk.run.people import People
 from tk.run.task import Task, TrackOptions
 from tk.trackers.protocol import Frame
@@ -29,3 +34,31 @@ def test_an_opening_ends_where_two_people_are_mixed_up(tmp_path: Path, meet: boo
     assert all([frame.index for frame in share] == list(range(len(share))) for share in shares)
     ends = sorted(len(share) for share in shares)
     assert len(ends) == 2 and (7 <= ends[0] < 16 if meet else ends == [16, 16])
+
+
+@pytest.mark.parametrize("failing", [{0}, {1}, {0, 1}])
+def test_somebody_who_cannot_be_tracked_does_not_end_the_run_of_others(tmp_path: Path, failing: set[int]) -> None:
+    calls: list[int] = []
+
+    class Finds(RegionTracker):
+        """A tracker that does not find some of those for whom it is started."""
+
+        def start(self, frames: Sequence[Frame], subject: Subject) -> None:
+            calls.append(len(calls))
+            if calls[-1] in failing:
+                raise CaptureError("no pose explains the masks")
+            self.take_body(build_cone_body(AVERAGE_BODY))
+
+    capture = open_capture(write_people(tmp_path / "two", [lambda _: (-0.6, 0.0), lambda _: (0.6, 0.1)], 1))
+    told: list[str] = []
+    task = Task(capture.setup(), capture, TrackOptions(people="all"))
+    people = People(task, Finds.of(task.setup, task.settings), told.append)
+    masks = np.stack([person_mask(camera, (-0.6, 0.0)) | person_mask(camera, (0.6, 0.1)) for camera in RIG])
+    opening = [Frame(k, np.zeros((*masks.shape, 3), np.uint8), masks) for k in range(2)]
+    if len(failing) == 2:
+        with pytest.raises(CaptureError, match="no pose explains"):
+            people.start(opening)
+        return
+    assert people.start(opening)
+    assert [member.number for member in people.members] == [0]
+    assert sum("cannot be tracked: no pose explains the masks" in line for line in told) == 1

@@ -37,7 +37,6 @@ from tk.run.refined_calibration import refine_capture
 from tk.run.refinement import BetterCameras
 from tk.settings import Settings
 from tk.trackers.camera_monitor import CameraMonitor
-from tk.trackers.region import UNKNOWN_AFTER
 
 TURNED = 1.0  # degrees, of cam2; a camera with a larger error is excluded
 
@@ -257,13 +256,6 @@ def test_landmarks_of_late_cameras_come_from_other_frames() -> None:
     assert retimed_landmarks(None, frames, np.array([0, 1, 0])) is None
 
 
-def test_sigma_is_unknown_from_the_first_frame_with_a_high_residual_on() -> None:
-    """The first pass knows only after some frames that the residual stays high."""
-    unknown = np.zeros(20, bool)
-    unknown[[12, 13]] = True
-    assert np.flatnonzero(finish.high_residual(unknown)).tolist() == list(range(13 - UNKNOWN_AFTER, 14))
-
-
 def judged(displacement: list[float], sigma: float = 0.01, blind: int = 0) -> tuple[Any, list[str]]:
     """Return the draft, and the notes, of frames with displacements of body and mask in four cameras, of which the
     last ones saw nobody."""
@@ -275,22 +267,15 @@ def judged(displacement: list[float], sigma: float = 0.01, blind: int = 0) -> tu
         "joints/sigma": np.full((F, 15), sigma),
         "joints/position": np.zeros((F, 15, 3)),
         "status": np.zeros(F, np.uint8),
+        "evidence/reason": np.zeros(F, np.uint8),
     }
     result: Any = SimpleNamespace(frames=np.arange(F), **dict.fromkeys(finish.COLUMNS.values()))
     draft = finish._Draft(result, np.zeros(F, np.bool_), np.zeros(F, np.bool_), columns)
     cameras: Any = SimpleNamespace(rig=ring_of_cameras(4, 160, 120))
     task: Any = SimpleNamespace(settings=Settings())
     finish._Finisher(task, True, notes.append, lambda _: None, cameras)._judge(draft, True)
+    finish.report_frames(result.frames, draft.current("evidence/reason"), notes.append)
     return draft, notes
-
-
-def test_all_frames_are_suspect_if_most_are_contradicted() -> None:
-    for count, all_of_them in ((0, False), (10, False), (30, True)):
-        draft, notes = judged(count * [0.5] + (40 - count) * [0.05])
-        suspect = draft.columns["status"] == Status.SUSPECT
-        assert suspect[:count].all() and suspect.all() == all_of_them and suspect[20:].any() == all_of_them
-        assert (np.isnan(draft.columns["joints/sigma"]).all(axis=1) == suspect).all()
-        assert len(notes) == bool(count)
 
 
 def test_cameras_from_opposite_sides_leave_sigma_unknown_and_are_named_as_the_cause() -> None:

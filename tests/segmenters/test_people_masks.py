@@ -101,7 +101,7 @@ def test_person_whom_one_camera_shows_is_in_its_mask() -> None:
 
 def test_nobody_is_segmented_where_nobody_is() -> None:
     segmenter = OneOfMany()
-    masks, uncertain, _ = masks_of(segmenter).label(shown([])[0])
+    masks, uncertain, *_ = masks_of(segmenter).label(shown([])[0])
     assert not masks.any() and not uncertain.any() and not segmenter.seen
 
 

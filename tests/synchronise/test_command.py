@@ -162,11 +162,49 @@ def no_sound_no_motion(folder: Path) -> None:
     write(folder / "b.mp4", Look(np.arange(250) / 25, noise.astype(np.uint8)))
 
 
+def another_name(folder: Path) -> None:
+    calibrate(folder)
+    (folder / "b.mp4").rename(folder / "x.mp4")
+
+
 def only_one(folder: Path) -> None:
     for name in ("b", "c"):
         (folder / f"{name}.mp4").unlink()
 
 
+def small(path: Path, shape: tuple[int, int] = (90, 160)) -> None:
+    """Write three seconds of noise."""
+    grey = np.random.default_rng(len(path.name)).normal(100, 20, (30, *shape))
+    write(path, Look(np.arange(30) / 10, np.clip(grey, 0, 255).astype(np.uint8)))
+
+
+def chapter_gap(folder: Path) -> None:
+    (folder / "b.mp4").unlink()
+    (folder / "b").mkdir()
+    for number in (1, 3):
+        small(folder / "b" / f"GX0{number}0012.MP4")
+
+
+def only_sound(folder: Path) -> None:
+    with av.open(str(folder / "b.mp4"), "w") as container:
+        audio = container.add_stream("aac", rate=RATE, layout="mono")
+        part = av.AudioFrame.from_ndarray(np.zeros((1, 2 * RATE), np.float32), "fltp", "mono")
+        part.sample_rate, part.pts = RATE, 0
+        container.mux(audio.encode(part))
+        container.mux(audio.encode())
+
+
+def other_size(folder: Path, shape: tuple[int, int]) -> None:
+    calibrate(folder)
+    small(folder / "b.mp4", shape)
+
+
+def cut_off(folder: Path) -> None:
+    whole = (folder / "b.mp4").read_bytes()
+    (folder / "b.mp4").write_bytes(whole[: len(whole) // 2])
+
+
+HAND = ("--offsets", "a=0,b=2.2,c=1")
 FAULTS: dict[str, tuple[Callable[[Path], object], tuple[str, ...], str]] = {
     "other sound and pictures": (other_sound, (), "camera b: not sure when it was recorded: its sound is another one"),
     "contradiction": (contradicting, (), "camera b: not sure when it was recorded: its sound and its pictures"),
@@ -178,7 +216,23 @@ FAULTS: dict[str, tuple[Callable[[Path], object], tuple[str, ...], str]] = {
     "one camera": (only_one, (), "holds one camera, a"),
     "two minutes late": (lambda _: None, ("--offsets", "a=0,b=120,c=1"), "camera b: has no time in common"),
     "camera without offset": (lambda _: None, ("--offsets", "a=0,b=2"), "camera c is missing"),
-    "name": (lambda f: (calibrate(f), (f / "b.mp4").rename(f / "x.mp4")), (), "camera x: has no camera in"),
+    "same file twice": (lambda f: shutil.copy(f / "a.mp4", f / "b.mp4"), (), "b.mp4: is the same file as"),
+    "same name twice": (lambda f: shutil.copy(f / "a.mp4", f / "a.mov"), (), "another file has the same name"),
+    "missing chapter": (chapter_gap, (), "GX030012.MP4: chapter 2 of this recording is missing"),
+    "only sound": (only_sound, (), "b.mp4: holds sound, but no video"),
+    "empty file": (lambda f: (f / "b.mp4").write_bytes(b""), (), "b.mp4: is an empty file"),
+    "cut off": (cut_off, (), "b.mp4: is cut off"),
+    "other resolution": (lambda f: other_size(f, (180, 320)), (), "camera b: is 320×180, but calibration.toml"),
+    "turned": (lambda f: other_size(f, (160, 90)), (), "camera b: is 90×160, but calibration.toml is of 160×90"),
+    "broken calibration": (lambda f: (f / "calibration.toml").write_text("a = ["), (), "calibration.toml"),
+    "from after the end": (lambda _: None, (*HAND, "--from", "300"), "--from 300: all cameras show"),
+    "empty outside": (lambda _: None, (*HAND, "--empty", "30:40"), "--empty 30:40: all cameras show"),
+    "unknown camera in offsets": (lambda _: None, ("--offsets", "a=0,b=2,x=1"), "there is no camera 'x'"),
+    "offset without number": (lambda _: None, ("--offsets", "a=0,b=two"), "--offsets a=0,b=two"),
+    "unknown camera": (lambda _: None, ("--cameras", "a,x"), "has no camera 'x'"),
+    "unknown method": (lambda _: None, ("--by", "smell"), "--by smell: must be one of"),
+    "ends before it begins": (lambda _: None, ("--from", "5", "--to", "3"), "ends before it begins"),
+    "name": (another_name, (), "camera x: has no camera in"),
 }  # fmt: skip
 
 

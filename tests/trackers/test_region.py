@@ -23,9 +23,10 @@ from tk.model.cameras.volume import Volume
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.setup import InitPose, Setup, Subject
 from tk.settings import RegionSettings, Settings, SilhouetteSettings
+from tk.trackers.judgement import UNKNOWN_AFTER
 from tk.trackers.proposals import anywhere, limbs
 from tk.trackers.proposals import exchanged as exchanged_limbs
-from tk.trackers.region import UNKNOWN_AFTER, RegionTracker
+from tk.trackers.region import RegionTracker
 from tk.trackers.residual import LEAST_SPREAD
 from tk.trackers.second_pass import second_of_two
 from tk.trackers.silhouette import SilhouetteTracker

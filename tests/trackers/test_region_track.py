@@ -117,7 +117,7 @@ def test_another_seed_searches_other_poses_and_finds_the_person_too(tiny: Path, 
 def test_result_that_contradicts_its_masks_is_suspect_and_ends_with_exit_code_3(
     tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("tk.trackers.residual.LEVEL", 1e-4)  # as if correct recordings fitted perfectly
+    monkeypatch.setattr("tk.trackers.judgement.LEVEL", 1e-4)  # as if correct recordings fitted perfectly
     reporter = Silent()
     summary = run(tiny, tmp_path / "r.h5", reporter, frames=(0, 4))
     assert (summary.frames, summary.suspect, summary.lost) == (4, 4, 0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -139,3 +141,27 @@ def test_the_only_body_gets_the_whole_masks() -> None:
     body = block(5, 15, 2.0)
     frame = masks_of(body)
     np.testing.assert_array_equal(assign(RIG, GRID, [body], frame).share(frame, 0).masks, frame.masks)
+
+
+def test_a_network_s_masks_of_people_move_the_border_between_bodies() -> None:
+    """The bodies are expected 0.2 m too far to the right."""
+    true, bodies = [block(4, 18, 3.0), block(18, 32, 3.0)], [block(8, 22, 3.0), block(22, 36, 3.0)]
+    frame = masks_of(*true)
+    people = np.zeros(frame.masks.shape, np.uint8)
+    for n, body in enumerate(true):
+        for view, label in enumerate(body.label):
+            people[view] |= enlarged(label, GRID.step, SHAPE[1:]) << n
+    alone, seen = (GRID.sample(assign(RIG, GRID, bodies, f).owner) for f in (frame, replace(frame, people=people)))
+    assert (alone[:, 12:38, 19:21] == 0).all()
+    assert (seen[:, 12:38, 19:21] == 1).all() and (seen[:, 12:38, 5:17] == 0).all()
+
+
+def test_a_network_s_mask_that_fits_no_body_shows_somebody_unknown() -> None:
+    known, stranger = block(4, 18, 3.0), block(18, 32, 3.0)
+    frame = masks_of(known, stranger)
+    people = np.zeros(frame.masks.shape, np.uint8)
+    for n, body in enumerate((known, stranger)):
+        for view, label in enumerate(body.label):
+            people[view] |= enlarged(label, GRID.step, SHAPE[1:]) << n
+    owner = GRID.sample(assign(RIG, GRID, [known], replace(frame, people=people)).owner)
+    assert (owner[:, 12:38, 6:16] == 0).all() and (owner[:, 12:38, 20:30] == NOBODY).all()

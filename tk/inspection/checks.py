@@ -37,6 +37,7 @@ from tk.run.segmentation import make_labeller
 from tk.run.task import Task
 from tk.settings import Settings
 from tk.threads import one_thread
+from tk.trackers.judgement import FAULTS
 
 Masks = NDArray[np.uint8]
 
@@ -172,7 +173,7 @@ def _read(capture: Capture, config: Settings, span: range, compared: set[int], k
                 read.small[i] = sampled(frame.images, labels)
                 for bad, reason in zip(read.bad_images, health.look(frame.images, read.masks[i]), strict=True):
                     if reason is not None:
-                        bad[i] = reason
+                        bad[i] = FAULTS[reason]
             if i in kept:
                 read.images[i] = frame.images.copy()
     return read

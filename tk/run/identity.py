@@ -184,5 +184,6 @@ def _with_rows(to: Result, rows: NDArray[np.int64], source: Result, other: NDArr
 #: the columns of a result that are exchanged, by dataset
 COLUMNS = {
     "pose": "pose", "joints/position": "joints", "joints/sigma": "sigma", "residual": "residual", "status": "status",
-    "objective": "objective", "landmarks": "landmarks",
+    "objective": "objective", "landmarks": "landmarks", "evidence/reason": "reason",
+    "evidence/camera": "camera_state",
 }  # fmt: skip

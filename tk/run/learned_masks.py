@@ -112,24 +112,25 @@ class LearnedMasks:
         height, width = np.max([(h, w) for w, h in self._sizes], axis=0)
         return _SAMPLE_BYTES // (5 * self._cameras * int(height) * int(width))
 
-    def label(self, frame: FrameSet) -> tuple[Masks, Bool, NDArray[np.uint8], NDArray[np.float64] | None]:
+    def label(self, frame: FrameSet) -> tuple[Masks, Bool, NDArray[np.uint8], NDArray[np.float64] | None, Masks | None]:
         """Return masks (C, H, W), uncertain pixels (C, H, W), where each camera's mask comes from (C,), and the
-        landmarks (N, C, L, 3) if the segmenter was asked for this frame."""
+        landmarks (N, C, L, 3) and the people's masks (C, H, W) if the segmenter was asked for this frame."""
         span = self._follow(frame) if self._source.frame_count is None else self._span_of(frame.index)
         before, after = span.around(frame.index) if span.samples else (None, None)
         asked = before is not None and before is after and before.index == frame.index
         if span.foreground is None or before is None or after is None:
-            seen = before.seen if before and asked else self._people.label(frame.images)
-            return seen.masks, seen.uncertain, np.full(self._cameras, SEGMENTER, np.uint8), seen.landmarks
+            whole = before.seen if before and asked else self._people.label(frame.images)
+            kind = np.full(self._cameras, SEGMENTER, np.uint8)
+            return whole.masks, whole.uncertain, kind, whole.landmarks, whole.people
         masks, uncertain = span.foreground.label(frame.images, _between(before, after))
         kind = np.full(self._cameras, LEARNED_AND_SEGMENTER if asked else LEARNED, np.uint8)
-        failed, landmarks = ~(before.agrees & after.agrees), before.seen.landmarks if asked else None
+        failed, seen = ~(before.agrees & after.agrees), before.seen if asked else None
         if failed.any():
-            seen = before.seen if asked else self._people.label(frame.images)
+            seen = seen or self._people.label(frame.images)
             masks[failed], uncertain[failed] = seen.masks[failed], seen.uncertain[failed]
             kind[failed] = SEGMENTER
-            landmarks = seen.landmarks
-        return self._people.without_specks(masks), uncertain, kind, landmarks
+        masks = self._people.without_specks(masks)
+        return masks, uncertain, kind, *((None, None) if seen is None else (seen.landmarks, seen.people))
 
     def _span_of(self, index: int) -> _Span:
         within = min(max(index, self._edges[0]), self._edges[-1] - 1)

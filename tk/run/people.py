@@ -37,7 +37,7 @@ from tk.run.one_person import really_there
 from tk.run.task import Task
 from tk.trackers.camera_monitor import CameraMonitor, spread_over
 from tk.trackers.protocol import Estimate, Frame, Tracker, sharing
-from tk.trackers.sharing import UNKNOWN_BY_HULLS, PixelOwners, assign, cast_points
+from tk.trackers.sharing import UNKNOWN_BY_HULLS, PixelOwners, assign, cast_points, matched_bodies
 
 _LOG = logging.getLogger(__name__)
 
@@ -234,12 +234,18 @@ class People:
         people = [found[n] for n in numbers]
         known = matched(subjects[:1] if self._choice == "auto" else subjects, people, self._setup.up)
         self._tracked = []
-        for k, subject in enumerate(known):
-            self._tracked.append(self._member(k, subject, self._new_tracker()))
         rest = [n for n, person in enumerate(found) if n not in numbers and person.views.sum() >= 2]
         shares = self._shares([*people, *(found[n] for n in rest)], opening)
-        for member, frames, person in zip(self._tracked, shares, people, strict=False):
-            self._begin(member, frames, person.height_m, opening)
+        for subject, frames, person in zip(known, shares, people, strict=False):
+            member = self._member(len(self._tracked), subject, self._new_tracker())
+            try:
+                self._begin(member, frames, person.height_m, opening)
+            except CaptureError as error:
+                if self._choice != "all" or (person is people[-1] and not self._tracked):
+                    raise
+                self._note(f"the person at {person.where} cannot be tracked: {error}")
+            else:
+                self._tracked.append(member)
         self._given.update(numbers)
         for n, frames in zip(rest, shares[len(people) :], strict=True):
             if found[n].inside and self._admit(frames, found[n], unknown(subjects[0]), written=False):
@@ -291,20 +297,28 @@ class People:
         at_first: list[int] = []  # voxels of each hull in the second frame: in the first, all masks carved it
         mixed = [False] * len(people)
         for frame in frames:
-            owners = assign(rig, grid, hulls, frame, UNKNOWN_BY_HULLS)
+            sighted = self._sighted(frame)
+            owners = assign(rig, grid, _in_place(sighted, hulls), frame, UNKNOWN_BY_HULLS)
             if frame is not frames[0]:
                 for k, place in enumerate(places):
                     points, places[k] = finder.around(place, owners.share(frame, k).masks, counts[k])
                     if len(points):
                         counts[k], hulls[k] = len(points), cast_points(rig, grid, points, finder.voxel_m)
                 at_first = at_first or list(counts)
-                owners = assign(rig, grid, hulls, frame, UNKNOWN_BY_HULLS)
+                owners = assign(rig, grid, _in_place(sighted, hulls), frame, UNKNOWN_BY_HULLS)
                 for k, (count, first) in enumerate(zip(counts, at_first, strict=True)):
                     mixed[k] |= not 1 / _MIXED < count / first < _MIXED
             for k, own in enumerate(shares):
                 if not mixed[k]:
                     own.append(owners.share(frame, k))
         return shares
+
+    def _sighted(self, frame: Frame) -> list[RenderedBody]:
+        """Return the bodies that the landmarks in a frame show."""
+        share = sharing(self._first)
+        if share is None or frame.landmarks is None:
+            return []
+        return [body for landmarks in frame.landmarks if (body := share.sighted(landmarks)) is not None]
 
     # --- one frame ----------------------------------------------------------------------------------------------------
 
@@ -528,6 +542,16 @@ class People:
             member.state = person.member
             self._tracked.append(member)
         self._given, self._contacts.all = set(state.given), state.contacts
+
+
+def _in_place(sighted: Sequence[RenderedBody], hulls: Sequence[RenderedBody]) -> list[RenderedBody]:
+    """Return people's hulls, or in their place the bodies that landmarks show: hulls of people who stand close together
+    contain parts of each other."""
+    whose = matched_bodies([body.label > 0 for body in sighted], hulls)
+    bodies = list(hulls)
+    for n, k in whose.items():
+        bodies[k] = sighted[n]
+    return bodies
 
 
 def _not_entered(number: int) -> str:

@@ -25,6 +25,7 @@ from tk.run.prefetch import TIMING_STAGES, Observations, open_observations
 from tk.run.segmentation import mask_source, sees_landmarks, sources_of_masks
 from tk.run.task import RecordingOptions, Task, describe
 from tk.trackers.bodies import read_body
+from tk.trackers.judgement import MEANINGS, STATE_MEANINGS
 from tk.trackers.protocol import Tracker
 from tk.trackers.registry import tracker_class
 
@@ -156,6 +157,8 @@ class Plan:
             residual_cameras=setup.rig.names if tracker.reports_sigma else (),
             mask_sources=sources_of_masks(task.source) if tracker.reports_sigma else (),
             landmark_names=LANDMARKS if tracker.reports_sigma and sees_landmarks(task) else (),
+            reasons=MEANINGS,
+            camera_states=STATE_MEANINGS if tracker.reports_sigma else (),
             segment_names=SEGMENTS if tracker.has_segments else (),
             feet=tracker.has_segments,
             angles=JointAngles.of_body(tracker.pose_names) if tracker.has_segments else (),

@@ -24,13 +24,14 @@ class Labels(NamedTuple):
     """The masks of a frame set.
 
     Attributes:
-        masks, uncertain, sources, landmarks: as a :class:`~tk.trackers.protocol.Frame` has them.
+        masks, uncertain, sources, landmarks, people: as a :class:`~tk.trackers.protocol.Frame` has them.
     """
 
     masks: NDArray[np.uint8]
     uncertain: NDArray[np.bool_] | None = None
     sources: NDArray[np.uint8] | None = None
     landmarks: NDArray[np.float64] | None = None
+    people: NDArray[np.uint8] | None = None
 
 
 Labeller = Callable[[FrameSet], Labels]
@@ -124,7 +125,8 @@ def _with_landmarks(task: Task, labeller: Labeller) -> Labeller:
     def label(frame: FrameSet) -> Labels:
         labels = labeller(frame)
         if labels.landmarks is None and frame.images.size:
-            labels = labels._replace(landmarks=people.label(frame.images).landmarks)
+            seen = people.label(frame.images)
+            labels = labels._replace(landmarks=seen.landmarks, people=seen.people)
         return labels
 
     return label

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -21,11 +21,12 @@ from tk.io.results.revision import revise_people
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
 from tk.run.loop import Loop, Output
-from tk.run.offline import CONTRADICTED, HIGH_RESIDUAL, ONE_SIDED, depth_known, finish, report_frames
+from tk.run.offline import finish
 from tk.run.plan import open_plan, recording_task
 from tk.run.reporter import Reporter
 from tk.run.task import RecordingOptions, Task
 from tk.threads import one_thread
+from tk.trackers.judgement import report_frames
 from tk.trackers.protocol import Estimate
 
 
@@ -141,9 +142,10 @@ def track_task(
                 for frame, estimates in enumerate(loop.frames(), plan.begin + done):
                     reporter.advance(frame, estimates[0] if estimates else None)
             if loop.tracked or loop.restore_unfinished(output):
-                if lines := loop.people.report():  # a damaged image may be the cause
-                    lines = [*task.source.damaged(plan.begin + done + loop.tracked, loop.people.doubted), *lines]
-                for line in lines:
+                damaged: Sequence[str] = ()  # images that may be the cause
+                if (doubted := loop.people.doubted).any():
+                    damaged = task.source.damaged(plan.begin + done + loop.tracked, doubted)
+                for line in (*damaged, *loop.people.report()):
                     note(line)
                 found = read_result(output).people
                 with one_thread():
@@ -173,18 +175,12 @@ def estimates(task: Task, note: Callable[[str], None] = lambda _: None) -> Itera
         note(line)
     with open_plan(task, note) as plan:
         loop = Loop(plan, note)
-        frames: defaultdict[int, tuple[list[int], ...]] = defaultdict(lambda: ([], [], []))  # by person and reason
+        found: defaultdict[int, dict[int, int]] = defaultdict(dict)  # reasons by frame, by person
         for estimate in chain.from_iterable(loop.frames()):
-            one_sided, unknown, suspect = frames[estimate.person]
-            if estimate.status == "suspect":
-                suspect.append(estimate.frame)
-            found = estimate.status not in ("lost", "absent")
-            if found and estimate.sigma is not None and np.isnan(estimate.sigma).all():
-                known = depth_known(task.setup.rig, estimate.joints, estimate.residual)
-                (unknown if known else one_sided).append(estimate.frame)
+            if estimate.reason:
+                found[estimate.person][estimate.frame] = estimate.reason
             yield estimate
         for line in loop.people.report():
             note(line)
-        for person in range(len(loop.people.members)):
-            for text, numbers in zip((ONE_SIDED, HIGH_RESIDUAL, CONTRADICTED), frames[person], strict=True):
-                report_frames(text, numbers, note)
+        for _, reasons in sorted(found.items()):
+            report_frames(list(reasons), list(reasons.values()), note)

@@ -90,11 +90,13 @@ class Segmented(NamedTuple):
         uncertain: (C, H, W) bool, where the mask is 0.
         landmarks: (N, C, L, 3) x, y, pixels, and visibility of each of N people's landmarks in each image, see
             :data:`~tk.model.body.body_points.LANDMARKS`; NaN where an image shows none.
+        people: (C, H, W) uint8, bit n: the mask of person n shows the pixel. Of the first eight people.
     """
 
     masks: Images
     uncertain: Bool
     landmarks: NDArray[np.float64]
+    people: Images
 
 
 class PeopleMasks:
@@ -116,14 +118,16 @@ class PeopleMasks:
 
     def label(self, images: Images) -> Segmented:
         """Return what the segmenter sees in images (C, H, W, 3); see :meth:`segment`."""
-        masks, uncertain = np.zeros(images.shape[:3], np.uint8), np.zeros(images.shape[:3], np.bool_)
+        masks, bits = np.zeros((2, *images.shape[:3]), np.uint8)
+        uncertain = np.zeros(images.shape[:3], np.bool_)
         people = self._people(images)
-        for person in people:
+        for n, person in enumerate(people):
             masks |= person.masks
+            bits |= person.masks & np.uint8(1 << n if n < 8 else 0)
             uncertain |= person.uncertain
         shape = len(people), len(images), len(LANDMARKS), 3
         landmarks = np.array([person.landmarks for person in people]).reshape(shape)
-        return Segmented(masks, uncertain & (masks == 0), associated(self._rig, landmarks))
+        return Segmented(masks, uncertain & (masks == 0), associated(self._rig, landmarks), bits)
 
     def without_specks(self, masks: Images) -> Images:
         """Return masks (C, H, W) without small parts that no other camera shows: shadows, reflections."""

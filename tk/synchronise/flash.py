@@ -1,10 +1,16 @@
-"""Offsets from flashes and other sudden changes of the light that all cameras see."""
+"""Offsets from flashes and other sudden changes of the light that all cameras see.
+
+An image that saw the light for a part of its exposure gives the instant of the change, if the length of the exposure is
+known; two images with the light off and on give a range. The exposure, with the readout of a rolling shutter, is
+unknown, and the same at all changes of a camera: the likelihood of an offset is summed over all lengths. A time stamp
+counts as the middle of the exposure.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,19 +28,41 @@ _SHARE = 0.5
 _MOST_EVENTS = 12
 #: a lone change convinces if it is so many times the second largest of the camera
 _LONE = 3.0
-#: share of an interval in which an image takes up light, exposure and readout of a rolling shutter; unknown, 0.3 to 1
-_OPEN = 0.6
-#: standard deviation of the time of a change between two images, and within one, of an interval, with that unknown
-_BETWEEN, _WITHIN = 0.2, 0.12
+#: standard deviation of the share of an exposure that saw the light: rows that are read later, and the gamma of cameras
+_SHARE_SIGMA = 0.1
+#: seconds of changes that give one offset: clocks drift apart by 2 ms at most
+_TOGETHER_S = 30.0
+#: samples of an interval, and lengths of the exposure, in the likelihood
+_STEPS, _LENGTHS = 60, np.linspace(0.1, 1.0, 10)
 
 
 @dataclass(frozen=True)
 class Event:
-    """A sudden change: own time, its standard deviation, both seconds, and the change, grey levels."""
+    """A sudden change of the light.
+
+    Attributes:
+        own_s: its own time, seconds, within half of an interval.
+        interval_s: of the images, seconds.
+        change: grey levels.
+        off_s, on_s: own times of the last image before and the first one after the change.
+        lit: share of its exposure after the change, of an image at ``own_s``; None without such an image.
+    """
 
     own_s: float
-    sigma_s: float
+    interval_s: float
     change: float
+    off_s: float
+    on_s: float
+    lit: float | None
+
+    def likelihood(self, times: Float) -> Float:
+        """Return (E, N) for each length of the exposure, the likelihood that the light changed at own times (N,)."""
+        open_s = _LENGTHS[:, None] * self.interval_s
+        sigma = _SHARE_SIGMA * open_s
+        if self.lit is not None:
+            return np.exp(-0.5 * ((times - self.own_s - open_s * (0.5 - self.lit)) / sigma) ** 2)
+        outside = np.maximum(self.off_s + open_s / 2 - times, times - self.on_s + open_s / 2)
+        return np.exp(-0.5 * (np.maximum(outside, 0.0) / sigma) ** 2)
 
 
 def find_events(look: Look) -> list[Event]:
@@ -65,12 +93,12 @@ def _event(look: Look, first: int, last: int) -> Event | None:
         return None
     if change < 0 and float((after - before < change / 2).mean()) < _SHARE:
         return None
-    interval = float(look.times_s[first + 1] - look.times_s[first])
+    off, on = float(look.times_s[first]), float(look.times_s[last + 1])
+    interval = (on - off) / (last + 1 - first)
     if last == first:  # the light changed between the exposures
-        return Event(float(look.times_s[first + 1]) - (1 - _OPEN) / 2 * interval, _BETWEEN * interval, change)
-    lit = float((look.brightness[first + 1] - look.brightness[first]) / change)
-    own = float(look.times_s[first + 1]) + _OPEN * float(1 - np.clip(lit, 0, 1)) * interval
-    return Event(own, _WITHIN * interval, change)
+        return Event((off + on) / 2, interval, change, off, on, None)
+    lit = float((look.brightness[last] - look.brightness[first]) / change)
+    return Event(float(look.times_s[last]), interval, change, off, on, min(max(lit, 0.0), 1.0))
 
 
 def compare_events(looks: Sequence[Look]) -> list[Tie]:
@@ -92,14 +120,15 @@ def _match(i: int, j: int, one: Sequence[Event], other: Sequence[Event]) -> list
         pairs = []
         for a in one:
             near = min(other, key=lambda b: abs(a.own_s - b.own_s - lag))
-            tolerance = 3.5 * float(np.hypot(a.sigma_s, near.sigma_s))
-            if abs(a.own_s - near.own_s - lag) < tolerance and np.sign(a.change) == np.sign(near.change):
+            if abs(a.own_s - near.own_s - lag) < (a.interval_s + near.interval_s) / 2 and np.sign(a.change) == np.sign(
+                near.change
+            ):
                 pairs.append((a, near))
         return pairs
 
     tried = [(fitting(a.own_s - b.own_s), a.own_s - b.own_s) for a in one for b in other]
     best, lag = max(tried, key=lambda each: (len(each[0]), sum(abs(a.change * b.change) ** 0.5 for a, b in each[0])))
-    width = 4 * max(event.sigma_s for event in (*one, *other))
+    width = 2 * max(event.interval_s for event in (*one, *other))
     second = max((len(pairs) for pairs, at in tried if abs(at - lag) > width), default=0)
     if not best:
         return []
@@ -111,4 +140,25 @@ def _match(i: int, j: int, one: Sequence[Event], other: Sequence[Event]) -> list
         lone = all(abs(best[0][k].change) > _LONE * (rest[0] if rest else 0.0) for k, rest in enumerate(rises))
         if not lone:
             return []
-    return [Tie(i, j, a.own_s, b.own_s, float(np.hypot(a.sigma_s, b.sigma_s)), "flash") for a, b in best]
+    groups = groupby(best, lambda pair: pair[0].own_s // _TOGETHER_S)
+    return [_tie(i, j, list(group), lag) for _, group in groups]
+
+
+def _tie(i: int, j: int, pairs: Sequence[tuple[Event, Event]], lag_s: float) -> Tie:
+    """Return the tie of some changes whose offset is near ``lag_s``: mean and deviation of their likelihood."""
+    step = min(min(a.interval_s, b.interval_s) for a, b in pairs) / _STEPS
+    reach = 2 * max(max(a.interval_s, b.interval_s) for a, b in pairs)
+    grid = np.arange(-reach, reach, step)
+    total = np.zeros((len(_LENGTHS), len(_LENGTHS), 2 * len(grid)))
+    for a, b in pairs:
+        times = a.own_s + grid
+        one = np.fft.rfft(a.likelihood(times), 2 * len(grid))
+        other = np.fft.rfft(b.likelihood(times - lag_s), 2 * len(grid))
+        both = np.fft.irfft(one[:, None] * np.conj(other[None]), 2 * len(grid))
+        total += np.log(np.maximum(both, 1e-12))
+    density = np.exp(total - total.max()).sum(axis=(0, 1))
+    lags = step * ((np.arange(len(density)) + len(grid)) % len(density) - len(grid))
+    mean = float((density * lags).sum() / density.sum())
+    sigma = float(np.sqrt((density * (lags - mean) ** 2).sum() / density.sum() + step**2))
+    own = float(np.mean([a.own_s for a, _ in pairs]))
+    return Tie(i, j, own, own - lag_s - mean, sigma, "flash")

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -124,17 +127,16 @@ def _images(recording: Recording, begin: float, end: float) -> Iterator[tuple[fl
         later = recording.shifts_s[n + 1] if n + 1 < len(recording.shifts_s) else np.inf
         if shift > end or (np.isfinite(later) and later + recording.times_s[0] < begin - 1.0):
             continue
-        container, stream = open_video(path)
-        stream.thread_type = "AUTO"
-        with container:
-            start = begin - shift
-            if start > recording.times_s[0] - shift + 1.0:
-                try:
-                    container.seek(int((start - 0.5) / stream.time_base), stream=stream)
-                except av.error.FFmpegError:  # no index: decoded from the start
-                    container.seek(0)
+        # seeking goes to a key frame before; without an index, in an MPEG stream, it may go too far
+        seeks = begin - shift > recording.times_s[0] - shift + 1.0
+        with ExitStack() as opened:
             try:
-                for image in decoded(container.demux(stream)):
+                images = _decoded(opened, path, begin - shift if seeks else None)
+                first = next(images, None)
+                if seeks and (first is None or first.time is None or first.time + shift > begin):
+                    images = _decoded(opened, path, None)
+                    first = next(images, None)
+                for image in chain(() if first is None else (first,), images):
                     if image.time is None:
                         continue
                     time = float(image.time) + shift
@@ -148,3 +150,16 @@ def _images(recording: Recording, begin: float, end: float) -> Iterator[tuple[fl
                     f"{path}: {recording.where}: cannot be decoded after {last:.1f} s: the file is cut off or damaged; "
                     "copy it again"
                 ) from None
+
+
+def _decoded(opened: ExitStack, path: Path, start_s: float | None) -> Iterator[Any]:
+    """Return the images of a file from a key frame about half a second before a time, or from its beginning."""
+    import av.error
+
+    container, stream = open_video(path)
+    opened.enter_context(container)
+    stream.thread_type = "AUTO"
+    if start_s is not None:
+        with suppress(av.error.FFmpegError):  # no index
+            container.seek(int((start_s - 0.5) / stream.time_base), stream=stream)
+    return decoded(container.demux(stream))

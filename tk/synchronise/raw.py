@@ -24,6 +24,8 @@ Float = NDArray[np.float64]
 SHORTEST_S = 2.0
 #: GoPro's names: GX020012.MP4 is chapter 2 of recording 12; the chapter stands before the number
 _GOPRO = re.compile(r"G[HXSL](\d\d)(\d{4})$", re.IGNORECASE)
+#: bytes at both ends by which files are compared
+_COMPARED = 1 << 16
 _TIMECODE = re.compile(r"(\d\d):(\d\d):(\d\d)([:;.])(\d+)$")
 
 
@@ -78,7 +80,8 @@ def read_raw(folder: Path, cameras: Sequence[str] | None = None) -> list[Recordi
     """Return the recording of each camera, by name.
 
     Raises:
-        CaptureError: the folder has fewer than two cameras, or a name is unknown.
+        CaptureError: the folder has fewer than two cameras, a name is unknown, a file is there twice, or a chapter is
+            missing.
         VideoError: a file is no video, or cannot be decoded.
         ClockError: a video has no time stamps, or is too short.
     """
@@ -89,8 +92,22 @@ def read_raw(folder: Path, cameras: Sequence[str] | None = None) -> list[Recordi
     chosen = {name: paths for name, paths in found.items() if cameras is None or name in cameras}
     if len(chosen) < 2:
         raise CaptureError(f"{folder}: holds one camera, {next(iter(chosen))}; tk sync needs the videos of two or more")
+    _check_different([path for paths in chosen.values() for path in paths])
     with ThreadPoolExecutor(2) as threads:
         return list(threads.map(lambda item: _read(*item), chosen.items()))
+
+
+def _check_different(files: Sequence[Path]) -> None:
+    """Raise CaptureError if two files are the same, by their size, beginning and end."""
+    seen: dict[tuple[int, bytes, bytes], Path] = {}
+    for path in files:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            begin = file.read(_COMPARED)
+            file.seek(max(size - _COMPARED, 0))
+            other = seen.setdefault((size, begin, file.read()), path)
+        if size and other != path:
+            raise CaptureError(f"{path}: is the same file as {other}; each camera, and each chapter, needs its own")
 
 
 def list_files(folder: Path) -> dict[str, tuple[Path, ...]]:
@@ -126,7 +143,7 @@ def read_cameras(folder: Path, recordings: Sequence[Recording]) -> tuple[Calibra
 
     Raises:
         CalibrationError: it cannot be read.
-        CaptureError: a recording has no camera in it.
+        CaptureError: a recording has no camera in it, or another size.
     """
     path = folder / "calibration.toml"
     if not path.exists():
@@ -142,6 +159,13 @@ def read_cameras(folder: Path, recordings: Sequence[Recording]) -> tuple[Calibra
             raise CaptureError(
                 f"camera {name}: has no camera in {path}, which has {', '.join(calibration.rig.names)}; "
                 "name the video as its camera"
+            )
+    for recording in recordings:
+        camera, size = cameras[recording.name], (recording.width, recording.height)
+        if (camera.width, camera.height) not in (size, size[::-1] if recording.turn % 180 else size):
+            raise CaptureError(
+                f"{recording.paths[0]}: {recording.where}: is {size[0]}×{size[1]}, but {path.name} is of "
+                f"{camera.width}×{camera.height}; calibrate for this size, or record with the calibrated one"
             )
     return calibration, [cameras[name] for name in names]
 
@@ -163,7 +187,12 @@ def _recordings(files: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
         name = _GOPRO.match(file.stem)
         groups.setdefault(name[2] if name else file.name, []).append(file)
     for group in groups.values():
-        yield tuple(sorted(group))
+        chapters = sorted(group)
+        numbers = [int(name[1]) for file in chapters if (name := _GOPRO.match(file.stem))]
+        for before, number, file in zip(numbers, numbers[1:], chapters[1:], strict=False):
+            if number != before + 1:
+                raise CaptureError(f"{file}: chapter {before + 1} of this recording is missing before it; copy it, too")
+        yield tuple(chapters)
 
 
 def _read(name: str, paths: tuple[Path, ...]) -> Recording:

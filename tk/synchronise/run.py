@@ -4,34 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError, VideoError
 from tk.model.cameras.camera import Camera
-from tk.model.cameras.common_view import closest_to_lines
 from tk.synchronise.decide import Decision, decide, timecode_ties
 from tk.synchronise.flash import compare_events
 from tk.synchronise.looks import LOOKED_S, Look, look_at
-from tk.synchronise.person import Aligned, align, compare_planes, compare_signals
+from tk.synchronise.person import Compared, align, compare_planes, compare_signals
 from tk.synchronise.raw import Recording
 from tk.synchronise.sound import hear, read_track
 from tk.synchronise.ties import Clocks, Tie, connected_to
+from tk.synchronise.travel import without_travel_time
 
 Float = NDArray[np.float64]
 
 #: methods that find offsets; the user can choose
 METHODS = ("sound", "flash", "person", "timecode")
-#: a camera's lag is certain if the mean significance over its pairs is above this, and above that of its second best
-#: lag by this factor; without and with known cameras. Chosen on raw folders made of two rendered recordings; the share
-#: of false lags above them has not been measured.
-_SURE, _SECOND = {"person": 5.0, "cameras": 6.0}, {"person": 1.35, "cameras": 1.25}
-#: a mirrored image fits better than the image by this factor
-_MIRRORED = 1.5
-#: speed of sound in air, m/s
-SOUND_M_S = 343.0
 
 
 @dataclass
@@ -84,14 +76,14 @@ def synchronise(
             tracks = list(threads.map(read_track, recordings))
         heard = hear(tracks)
         found = [tie for each in heard.values() for tie in each.ties]
-        if cameras:
-            found = without_travel_time(found, cameras)
         ties += found
         linked = connected_to(0, count, [(tie.i, tie.j) for tie in found])
         for c in np.flatnonzero(~linked).tolist():
             silent = tracks[c] is None or tracks[c].silent
             reasons[c].append("it has no sound" if silent else "its sound is another one")
     looks = _look(recordings, ties, begin_s, progress)
+    if cameras and ties:
+        ties = without_travel_time(ties, cameras, looks)
     if "flash" in methods:
         ties += compare_events(looks)
     mirrored: list[int] = []
@@ -99,12 +91,13 @@ def synchronise(
         progress("comparing what moves")
         kind = "cameras" if cameras else "person"
         pairs = compare_planes(looks, cameras) if cameras else compare_signals(looks)
-        aligned = align(pairs, count, [recording.interval_s for recording in recordings], kind)
-        sure = _sure(aligned, kind)
-        ties += [tie for tie in aligned.ties if sure[tie.i] and sure[tie.j]]
-        if cameras and not sure.all() and count > 2:
-            mirrored = _mirrored(looks, cameras, aligned, sure)
-        for c in np.flatnonzero(~sure).tolist():
+        intervals = [recording.interval_s for recording in recordings]
+        aligned = align(pairs, count, intervals, kind)
+        ties += aligned.ties
+        unsure = [c for c in range(count) if not aligned.sure(c)]
+        if cameras and count > 2:
+            mirrored = [c for c in unsure if is_mirrored(c, looks, cameras, pairs, intervals)]
+        for c in unsure:
             still = "nothing moves in it" if not looks[c].changes.any() else "its motion fits none of the others"
             reasons[c].append("its picture is mirrored" if c in mirrored else still)
     if "timecode" in methods:
@@ -113,17 +106,6 @@ def synchronise(
     for c in mirrored:
         decision.unsure[c] = "its picture is mirrored, by the calibration; turn mirroring off in the camera"
     return Synchronised(recordings, decision, looks, mirrored)
-
-
-def without_travel_time(ties: list[Tie], cameras: Sequence[Camera]) -> list[Tie]:
-    """Return ties of sound as if it had been made at each camera: it comes from where all cameras look at, to some
-    metres."""
-    centers = np.array([camera.center for camera in cameras])
-    middle = closest_to_lines(centers, np.array([camera.rotation[2] for camera in cameras]))
-    if middle is None:
-        return ties
-    travel_s = np.linalg.norm(centers - middle, axis=1) / SOUND_M_S
-    return [replace(tie, own_i=tie.own_i - travel_s[tie.i], own_j=tie.own_j - travel_s[tie.j]) for tie in ties]
 
 
 def by_hand(recordings: list[Recording], offsets_s: dict[str, float], begin_s: float | None) -> Synchronised:
@@ -182,17 +164,14 @@ def _look(
     return looks
 
 
-def _sure(aligned: Aligned, kind: str) -> NDArray[np.bool_]:
-    """Return (C,) whether the lag of each camera is certain."""
-    return np.asarray((aligned.best > _SURE[kind]) & (aligned.best > _SECOND[kind] * np.maximum(aligned.second, 0.0)))
-
-
-def _mirrored(looks: Sequence[Look], cameras: Sequence[Camera], aligned: Aligned, sure: NDArray[np.bool_]) -> list[int]:
-    """Return cameras whose mirrored images fit the others, and whose images do not."""
-    found = []
-    for c in np.flatnonzero(~sure).tolist():
-        pairs = compare_planes(looks, cameras, mirrored=c)
-        best = [float(np.max(pair.z)) for pair in pairs]
-        if best and np.mean(best) > max(_SURE["cameras"], _MIRRORED * float(aligned.best[c])):
-            found.append(c)
-    return found
+def is_mirrored(
+    camera: int,
+    looks: Sequence[Look],
+    cameras: Sequence[Camera],
+    pairs: Sequence[Compared],
+    intervals_s: Sequence[float],
+) -> bool:
+    """Return whether a camera whose lag is uncertain has a certain one with its images mirrored."""
+    others = [pair for pair in pairs if camera not in (pair.i, pair.j)]
+    turned = compare_planes(looks, cameras, mirrored=camera)
+    return align([*others, *turned], len(cameras), intervals_s, "cameras").sure(camera)

@@ -86,7 +86,7 @@ def solve(count: int, ties: Sequence[Tie], reference: int = 0, skew_sigma_s: flo
 
     Pairs of cameras that contradict the others are left out, the worst first, as long as all cameras stay connected.
     """
-    kept = list(ties)
+    kept = _not_counted_twice(ties)
     dropped: list[tuple[int, int, str]] = []
     while True:
         clocks, residuals = _fit(count, kept, reference, skew_sigma_s, np.full(count, RATE_SIGMA))
@@ -106,6 +106,16 @@ def solve(count: int, ties: Sequence[Tie], reference: int = 0, skew_sigma_s: flo
             return replace(final, rate_sigma=clocks.rate_sigma, dropped=tuple(dropped))
         dropped.append(worst)
         kept = [tie for tie in kept if (tie.i, tie.j, tie.kind) != worst]
+
+
+def _not_counted_twice(ties: Sequence[Tie]) -> list[Tie]:
+    """Return the ties with larger deviations: the pairs of C cameras are differences of C values, so that pairs beyond
+    C - 1 say nothing new."""
+    factors = {}
+    for kind in {tie.kind for tie in ties}:
+        pairs = {(tie.i, tie.j) for tie in ties if tie.kind == kind}
+        factors[kind] = (len(pairs) / max(len({c for pair in pairs for c in pair}) - 1, 1)) ** 0.5
+    return [replace(tie, sigma_s=tie.sigma_s * max(factors[tie.kind], 1.0)) for tie in ties]
 
 
 def _fit(

@@ -2,8 +2,8 @@
 
 Three checks exclude a camera: its image shows nothing, is frozen, or has moved since the first frame, so that the
 calibration is no longer true (:mod:`tk.model.masks.image_health`); in the opening frames its masks contradict those of
-the other cameras (:mod:`tk.model.masks.mask_agreement`); or, in a later frame, its residual is an outlier
-(:mod:`tk.trackers.residual_judge`).
+the other cameras (:mod:`tk.model.masks.mask_agreement`); or, in a later frame, its residual is explained best by a
+fault of the camera (:mod:`tk.trackers.judgement`).
 
 Only contour trackers can go without a camera: a visual hull without one of its masks is empty.
 """
@@ -13,33 +13,49 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
-from tk.kernels.mask_values import OTHERS
+from tk.io.results.status import Status
+from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.body.joint_sigma import VIEW_M
 from tk.model.body.plausibility import LastAccepted, Plausibility, check_extent, check_stature
 from tk.model.body.skeleton import JOINTS
+from tk.model.cameras.common_view import determine_depth
 from tk.model.cameras.landmark_agreement import evidence_for_cameras
+from tk.model.cues.ray_costs import residual_of
 from tk.model.masks.image_health import MOVED, HealthState, ImageHealth, described
 from tk.model.masks.mask_agreement import Agreement, MaskAgreement
+from tk.model.masks.regions import SQUARE3
 from tk.model.setup import Setup, Subject
 from tk.model.stateful import Stateful
+from tk.trackers.judgement import (
+    CONSEQUENCES,
+    FAULTS,
+    STATES,
+    WRONG,
+    Belief,
+    Cameras,
+    FrameEvidence,
+    Reason,
+    depth_known,
+    first_reason,
+    is_status,
+    judge_frames,
+    likelihoods,
+    refused,
+)
 from tk.trackers.protocol import Estimate, Frame, Tracker, sharing, shows_person, without_cameras
 from tk.trackers.region import RegionTracker
-from tk.trackers.residual import RATE
-from tk.trackers.residual_judge import JudgeState, ResidualJudge
 
 Float = NDArray[np.float64]
 
 # Frames of the opening that are compared.
 _OPENING = 5
-# Reasons, as in messages.
-_DISAGREES, _TOO_FEW = "disagrees with the others", "fewer than two cameras see anybody"
-_MISSING = "misses a part of the person"
-_IMPLAUSIBLE = "the pose found cannot be true"
-_JUMPED = "the person is elsewhere than in the frame before, as after a cut in the recording"
+# Missing area on uncertain pixels is ignored, unless it is more than this share of the mask: too little is left then.
+_TOO_LITTLE = 0.5
 
 Span = tuple[int, int, int]
 """Frames: the first, the last, and their number."""
@@ -68,24 +84,25 @@ class MonitorState:
     """What is known of C cameras and of the person.
 
     Attributes:
-        excluded: (C,) cameras that are wrong.
+        cameras: what is believed of them.
         refused: poses refused since the last accepted one, because of their residual.
         was_lost: whether the last frame has no pose.
-        spans: of exclusion, by "camera/reason".
-        lost: losses and jumps, by reason.
+        spans: of exclusion, by "camera/state".
+        doubted: (C,) see :class:`CameraMonitor`.
+        recent: what the last frames show.
         opening_reasons: why cameras are excluded from the opening on.
-        health, plausibility, judge: the parts; None without a judge.
+        health, plausibility: the parts.
     """
 
-    excluded: NDArray[np.bool_]
+    cameras: Belief
     refused: int
     was_lost: bool
     spans: dict[str, Span]
-    lost: dict[str, Span]
+    doubted: NDArray[np.bool_]
+    recent: FrameEvidence
     opening_reasons: dict[int, str]
     health: HealthState
     plausibility: LastAccepted
-    judge: JudgeState | None
 
 
 class CameraMonitor(Stateful[MonitorState]):
@@ -95,6 +112,10 @@ class CameraMonitor(Stateful[MonitorState]):
         tracker: the caller starts it with the frames of :meth:`start`, or restores it.
         setup: rig, working volume, upward direction and rate.
         subject: what is known of the person.
+
+    Attributes:
+        doubted: (C,) cameras whose images may be the cause of a fault: those that were left out, which the others
+            contradicted; all of them if the person was lost, or jumped.
     """
 
     State = MonitorState
@@ -105,11 +126,11 @@ class CameraMonitor(Stateful[MonitorState]):
         self._health = ImageHealth()
         self._plausibility = Plausibility(setup.fps)
         C = len(self._names)
-        self.unfit = np.zeros(C, bool)  # cameras that their image excludes from the last frame
-        self._excluded = np.zeros(C, bool)
-        self._judge = ResidualJudge(tracker, setup.rig) if isinstance(tracker, RegionTracker) else None
+        self.doubted = np.zeros(C, bool)
+        self._cameras = Cameras(C, setup.fps)
+        self._region = tracker if isinstance(tracker, RegionTracker) else None  # only this one has residuals
         self._spans: dict[str, Span] = {}
-        self._lost: dict[str, Span] = {}
+        self._recent = FrameEvidence.none(C)
         self._opening_reasons: dict[int, str] = {}
         self._refused = 0
         self._was_lost = False
@@ -128,27 +149,29 @@ class CameraMonitor(Stateful[MonitorState]):
                 `capture.toml`.
         """
         health = ImageHealth()
-        bad = np.array([self._bad(health.look(f.images, f.masks)) for f in frames])
+        found = [[fault is not None for fault in health.look(f.images, f.masks)] for f in frames]
+        bad = np.array(found) & self.tracker.can_exclude_cameras  # trackers of hulls need all cameras
         shown = [without_cameras(f, b) for f, b in zip(frames, bad, strict=True)]
         agreement = opening_agreement(self._setup, shown)
         if whole and (agreement.refusal or np.count_nonzero(agreement.tested_right) < 2):
             agreement = opening_agreement(self._setup, [without_cameras(f, np.asarray(bad.all(axis=0))) for f in whole])
         if agreement.refusal:
             raise CaptureError(agreement.refusal)
-        if self._judge is not None:
-            self._judge.tracker.view_m = float(np.hypot(VIEW_M, agreement.undetected_m))
+        if self._region is not None:
+            self._region.view_m = float(np.hypot(VIEW_M, agreement.undetected_m))
         for camera in agreement.wrong:
-            self._excluded[camera] = True
+            self._cameras.be(camera, WRONG)
             self._opening_reasons[camera] = agreement.reason(camera)
-        if self._excluded.any() and not self.tracker.can_exclude_cameras:
+        out = self._cameras.states > 0
+        if out.any() and not self.tracker.can_exclude_cameras:
             reasons = (
-                f"camera {self._names[c]} {_DISAGREES} ({reason})" for c, reason in self._opening_reasons.items()
+                f"camera {self._names[c]} {FAULTS[WRONG]} ({reason})" for c, reason in self._opening_reasons.items()
             )
             raise CaptureError(f"{'; '.join(reasons)}: this method needs masks that fit from all cameras")
         alone = not any((f.masks == OTHERS).any() for f in frames)  # the hull of two people is larger than one
         if self._subject.height_m is not None and alone:
             check_extent(agreement.extent_m, self._subject.height_m)
-        return [without_cameras(f, self._excluded) for f in shown]
+        return [without_cameras(f, out) for f in shown]
 
     def check_body(self) -> None:
         """Refuse a body of an impossible size, after the tracker's start.
@@ -161,88 +184,170 @@ class CameraMonitor(Stateful[MonitorState]):
 
     def step(self, frame: Frame) -> tuple[Estimate, Frame]:
         """Return the estimate for the next frame, and the observation without the excluded cameras."""
-        unhealthy = self._health.look(frame.images, frame.masks, self._excluded)
-        self.unfit = bad = self._bad(unhealthy)
-        out = bad | self._excluded
-        used = without_cameras(frame, out)
+        cameras = self._cameras
+        faults = self._health.look(frame.images, frame.masks, (cameras.states > 0) & ~cameras.unfit)
+        if self.tracker.can_exclude_cameras:
+            cameras.look(faults)
+        out = cameras.states
+        used = without_cameras(frame, out > 0)
         if np.count_nonzero(shows_person(used.masks)) < 2:
             used = without_cameras(frame, np.ones(len(out), bool))  # one view does not determine depth
-        if self._judge is not None and len(out) - bad.sum() >= 3:
-            estimate, used, self._excess = self._judge.step(frame, used, bad, self._excluded)
+        self._excess = 0.0
+        if self._region is not None and np.count_nonzero(~cameras.unfit) >= 3:
+            estimate, used = self._weigh(self._region, frame, used)
         else:
-            estimate, self._excess = self.tracker.step(used), 0.0
-        for camera, reason in enumerate(unhealthy):
-            if reason is not None and bad[camera]:
-                _count(self._spans, f"{camera}/{reason}", frame.index)
-        for camera in np.flatnonzero((out | self._excluded) & ~bad).tolist():
-            torn = self._judge is not None and self._judge.torn[camera]
-            reason = _MISSING if torn else _DISAGREES
-            _count(self._spans, f"{camera}/{reason}", frame.index)
-        if estimate.status == "recovered" and not self._was_lost:
-            _count(self._lost, _JUMPED, frame.index)
-        estimate = self._plausible(frame.index, estimate, used)
-        self._was_lost = estimate.status == "lost"
-        if self._judge is not None and estimate.status != "lost" and self._judge.contradicts(estimate):
-            estimate = replace(estimate, status="suspect")
+            estimate = self.tracker.step(used)
+        out = np.where(out > 0, out, cameras.states)
+        estimate = replace(estimate, cameras=out, shift=self._health.moved)
+        for camera, state in enumerate(out.tolist()):
+            if state:
+                self.doubted[camera] = True
+                _count(self._spans, f"{camera}/{STATES[state]}", frame.index)
+        return self._judged(frame.index, estimate, used), used
+
+    def _weigh(self, tracker: RegionTracker, frame: Frame, used: Frame) -> tuple[Estimate, Frame]:
+        """Step the tracker, and judge the cameras by their residuals. Return the estimate and the observation without
+        the cameras that were left out.
+
+        Cameras that see the person from the same or from opposite sides say nothing about another one, because they do
+        not determine a pose.
+        """
+        cameras, before = self._cameras, tracker.state
+        estimate = tracker.step(used)
+        if estimate.residual is None or not shows_person(used.masks).any():
+            return estimate, used
+        residual, left_out = estimate.residual, (cameras.states > 0) & ~cameras.unfit
+        kept = (cameras.states == 0) & np.isfinite(residual[:, 0])
+        touched = touched_by_others(tracker.screen.sample(frame.masks))
+        suspect = self._suspect(tracker, residual, kept, touched)
+        if left_out.any() or suspect is not None:
+            residual = self._residual(tracker, frame, estimate)
+            suspect = self._suspect(tracker, residual, kept, touched)
+        if suspect is not None:
+            others = kept & (np.arange(len(kept)) != suspect)
+            if determine_depth(self._setup.rig.centers, estimate.joints.mean(axis=0), others):
+                after, fewer = tracker.state, without_cameras(used, ~others)
+                tracker.state = before
+                second = tracker.step(fewer)
+                again = self._residual(tracker, frame, second)
+                # both poses by a baseline that has not learned this frame from the camera
+                with_it, without = (_likelihoods(tracker, found, touched) for found in (residual, again))
+                if cameras.judge(suspect, others, with_it, without):
+                    estimate, used = replace(second, status=estimate.status), fewer
+                    kept, residual = others, again
+                else:
+                    tracker.state = after
+        cameras.weigh(left_out & np.isfinite(residual[:, 0]), _likelihoods(tracker, residual, touched))
+        self._excess = tracker.residuals.mean_excess(np.where(kept, residual.sum(axis=1), np.nan))
         return estimate, used
 
-    def _bad(self, unhealthy: Sequence[str | None]) -> NDArray[np.bool_]:
-        """Return (C,) the cameras whose image excludes them. Trackers of hulls need all cameras."""
-        return np.array([self.tracker.can_exclude_cameras and reason is not None for reason in unhealthy])
+    def _suspect(
+        self, tracker: RegionTracker, residual: Float, kept: NDArray[np.bool_], touched: NDArray[np.bool_]
+    ) -> int | None:
+        """Return the camera that is to be judged, by a residual (C, 2); None if none is."""
+        if np.count_nonzero(kept) < 3:
+            return None
+        best = likelihoods(np.zeros_like(residual), tracker.residuals.spread)
+        return self._cameras.suspect(_likelihoods(tracker, residual, touched), best, kept)
 
-    def _plausible(self, index: int, estimate: Estimate, used: Frame) -> Estimate:
-        """Return the estimate, with status lost if it is impossible."""
-        if estimate.status == "lost":
+    def _residual(self, tracker: RegionTracker, frame: Frame, estimate: Estimate) -> Float:
+        """Return (C, 2) missing and surplus area at the estimate's pose, of excluded cameras, too. Missing area on
+        uncertain pixels is not counted if enough of the mask is left. NaN where a camera sees nobody, or no body was
+        fitted.
+        """
+        drawn = estimate.drawn
+        if drawn is None or estimate.masks is None:
+            return np.full((len(frame.masks), 2), np.nan)
+        masks, used = estimate.masks, shows_person(estimate.masks)
+        if not used.all():
+            masks = masks.copy()
+            masks[~used] = tracker.cleaned(frame.masks[~used])
+        sampled = tracker.screen.sample(masks)
+        person, others = sampled >= PERSON, sampled == OTHERS
+        residual = residual_of(drawn, person, others)
+        if frame.uncertain is not None:
+            excused = residual_of(drawn & tracker.screen.sample(frame.uncertain), person, others)[:, 0]
+            residual[:, 0] -= np.where(excused < _TOO_LITTLE, excused, 0.0)
+        return residual
+
+    def _judged(self, index: int, estimate: Estimate, used: Frame) -> Estimate:
+        """Return the estimate of a frame with the status and the sigma that follow from its reason."""
+        found = self._found(index, estimate, used)
+        if is_status(np.array(found), Status.LOST):
             self._plausibility.forget()
-            if not shows_person(used.masks).any():
-                _count(self._lost, _TOO_FEW, index)
-            return estimate
-        if estimate.status == "recovered":  # the person may be elsewhere, as after a cut
+            if estimate.status != "lost" and (tracker := sharing(self.tracker)) is not None:
+                tracker.lose()
+            reason = found
+        else:
+            residual = np.full((len(self._names), 2), np.nan) if estimate.residual is None else estimate.residual
+            depth = bool(depth_known(self._setup.rig, estimate.joints, estimate.residual))
+            self._recent = self._recent.then(found, residual, depth)
+            reason = Reason(judge_frames(self._recent, self._false_alarm)[-1])
+        then = CONSEQUENCES[reason]
+        status = estimate.status if then.status is None else then.status.name.lower()
+        self._was_lost = status == "lost"
+        self.doubted |= self._was_lost or found == Reason.CUT
+        unknown = estimate.sigma is not None and not then.sigma
+        sigma = np.full(len(JOINTS), np.nan) if unknown else estimate.sigma
+        return replace(estimate, status=status, reason=int(reason), sigma=sigma)
+
+    def _found(self, index: int, estimate: Estimate, used: Frame) -> Reason:
+        """Return the reason that a frame itself shows."""
+        first = first_reason(estimate.status, estimate.sigma, not shows_person(used.masks).any())
+        if estimate.status == "lost":
+            return first
+        recovered = estimate.status == "recovered"
+        if recovered:  # the person may be elsewhere, as after a cut
             self._plausibility.forget()
         reason = self._plausibility.judge(index, estimate.joints)
-        if reason is None and estimate.status == "recovered" and self._excess > self._accepted:
-            reason = "after a loss its residual is still high"
+        if reason is None and recovered and refused(self._excess, self._refused, self._false_alarm):
             self._refused += 1
-        if reason is None:
-            self._refused = 0
-            return estimate
-        _count(self._lost, f"{_IMPLAUSIBLE}: {reason}", index)
-        self._plausibility.forget()
-        if (tracker := sharing(self.tracker)) is not None:
-            tracker.lose()
-        return replace(estimate, status="lost", sigma=None if estimate.sigma is None else np.full(len(JOINTS), np.nan))
+            return Reason.STILL_HIGH
+        if reason is not None:
+            return Reason[reason]
+        self._refused = 0
+        if recovered and not self._was_lost:
+            return Reason.CUT
+        return first
 
     @property
-    def _accepted(self) -> float:
-        """The largest excess of a pose after a loss: one spread, because no prediction supports such a pose. After the
-        frames in which a baseline follows a change (1 / RATE), the level itself may have changed, and only an abnormal
-        residual refuses a pose. With twice the limit, a mirrored pose was accepted for 12 frames (fault "away")."""
-        return self._judge.normal if self._judge is not None and self._refused >= 1 / RATE else 1.0
+    def _false_alarm(self) -> float:
+        """See :func:`judge_frames`; only region trackers have residuals."""
+        return 0.5 if self._region is None else self._region.config.false_alarm
+
+    @property
+    def unfit(self) -> NDArray[np.bool_]:
+        """(C,) cameras that their image excludes from the last frame."""
+        return self._cameras.unfit
 
     @property
     def moved(self) -> NDArray[np.bool_]:
         """(C,) the cameras that have been moved since the first frame."""
         return np.array([f"{camera}/{MOVED}" in self._spans for camera in range(len(self._names))])
 
-    @property
-    def doubted(self) -> NDArray[np.bool_]:
-        """(C,) the cameras whose images may be the cause of a line of :meth:`report`: those that were left out, which
-        the others contradicted; all of them if the person was lost, or jumped."""
-        left_out = {int(key.partition("/")[0]) for key in self._spans}
-        return np.array([bool(self._lost) or camera in left_out for camera in range(len(self._names))])
-
     def report(self) -> list[str]:
-        """Return a line for each camera and reason of exclusion, and for each reason of a loss."""
+        """Return a line for each camera and reason of exclusion."""
         lines = []
         for key, span in sorted(self._spans.items()):
-            camera, _, reason = key.partition("/")
-            because = self._opening_reasons.get(int(camera)) if reason == _DISAGREES else None
+            camera, _, state = key.partition("/")
+            because = self._opening_reasons.get(int(camera)) if state == WRONG else None
             more = f" ({because})" if because else ""
-            lines.append(f"camera {self._names[int(camera)]} {reason}{more}: left out of {described(*span)}")
-        # without two views the person may also be absent, which the monitor does not know
-        outcome = {_TOO_FEW: "no pose", _JUMPED: "searched for again"}
-        status = {reason: outcome.get(reason, "lost") for reason in self._lost}
-        return lines + [f"{reason}: {status[reason]}, {described(*span)}" for reason, span in self._lost.items()]
+            lines.append(f"camera {self._names[int(camera)]} {FAULTS[state]}{more}: left out of {described(*span)}")
+        return lines
+
+
+def _likelihoods(tracker: RegionTracker, residual: Float, touched: NDArray[np.bool_]) -> Float:
+    """Return (C, 3) those of the cameras' states, from a residual (C, 2)."""
+    return likelihoods(tracker.residuals.excess(residual), tracker.residuals.spread, touched)
+
+
+def touched_by_others(masks: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return (C,) whether pixels of others touch those of the person in masks (C, h, w)."""
+    others = masks == OTHERS
+    return np.array([
+        bool(mine.any() and (cv2.dilate(mine.view(np.uint8), SQUARE3) & (mask >= PERSON)).any())
+        for mine, mask in zip(others, masks, strict=True)
+    ])  # fmt: skip
 
 
 def _count(spans: dict[str, Span], key: str, index: int) -> None:

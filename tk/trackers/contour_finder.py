@@ -18,7 +18,7 @@ from tk.kernels.line_search import SearchSettings
 from tk.kernels.mask_values import PERSON
 from tk.kernels.silhouette import descend, normal_equations
 from tk.model.body.anthropometry import AVERAGE_BODY, BodyDimensions
-from tk.model.body.body_fit import INFORMATIVE_FRAMES, STATURE_DEVIATION, fit_body
+from tk.model.body.body_fit import INFORMATIVE_FRAMES, STATURE_DEVIATION, FittedBody, fit_body
 from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.initial_pose import rough_pose
 from tk.model.body.limb_candidates import Limb, limbs_of
@@ -27,9 +27,10 @@ from tk.model.body.stored_body import body_values
 from tk.model.cameras.bundle import CORRELATION_PX
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import spread_out
+from tk.model.cameras.landmark_agreement import consensus
 from tk.model.cameras.tracker_frame import TrackerFrame
-from tk.model.cues.landmarks import WEIGHT, LandmarkCue, of_person
-from tk.model.cues.part_colors import PartColors
+from tk.model.cues.landmarks import WEIGHT, LandmarkCue, of_person, propose
+from tk.model.cues.part_colors import PartColors, RenderedBody
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Pyramid, Views
 from tk.model.setup import Subject
@@ -248,7 +249,7 @@ class ContourFinder:
         deviation = STATURE_DEVIATION if known else ESTIMATED_STATURE_DEVIATION
         found: list[tuple[float, ConeBody, Float]] = []
         for hypothesis in hypotheses:
-            body, fitted = self.fit(pyramids, hypothesis.poses, chosen, stature, deviation)
+            body, fitted, _ = self.fit(pyramids, hypothesis.poses, chosen, stature, deviation)
             cost = hypothesis.cost
             if len(hypotheses) > 1:
                 self.take_body(body)
@@ -270,8 +271,8 @@ class ContourFinder:
         chosen: NDArray[np.int64],
         stature: float,
         stature_deviation: float = STATURE_DEVIATION,
-    ) -> tuple[ConeBody, Float]:
-        """Fit the body to the chosen ones of several frames; return it, and its poses in them."""
+    ) -> FittedBody:
+        """Fit the body to the chosen ones of several frames."""
         seen = [pyramids[i] for i in chosen]
         return fit_body(self.views, seen, poses[chosen], self.line_search, stature, stature_deviation)
 
@@ -281,6 +282,17 @@ class ContourFinder:
         """Return the frame's silhouettes, cleaned, at all scales, and the person's landmarks."""
         pyramid = self.views.pyramid(frame.masks, self.solver.scales, True)
         return replace(pyramid, landmarks=of_person(frame.landmarks, pyramid.masks[0]))
+
+    def sighted(self, landmarks: Float) -> RenderedBody | None:
+        """Return the average body on the grid :attr:`choice`, at the pose that a person's landmarks (V, L, 3) show;
+        None if no two images agree on them."""
+        points = consensus(self.views.rig, landmarks).points
+        if not np.isfinite(points).any():
+            return None
+        body = build_cone_body(AVERAGE_BODY)
+        poses = propose(self.views.rig, body, landmarks, np.nanmean(points, axis=0))
+        met = self.choice.render(body, poses[:1])
+        return RenderedBody(met.label[0], met.depth[0])
 
     def landmarks(self, pyramid: Pyramid) -> LandmarkCue | None:
         """Return the landmarks of the person in a frame as a cue, if there are any."""

@@ -41,6 +41,8 @@ class Frame:
         sources: (C,) uint8, where a segmenter's masks come from, see :mod:`tk.run.learned_masks`; None for others.
         landmarks: (N, C, L, 3) x, y, pixels, and visibility of the landmarks of N people in view, see
             :mod:`tk.model.cues.landmarks`; NaN where they are unknown. None if no network saw this frame.
+        people: (C, H, W) uint8, bit n: the network's mask of person n of ``landmarks`` shows the pixel. None if no
+            network saw this frame.
     """
 
     index: int
@@ -50,6 +52,7 @@ class Frame:
     time: float = 0.0
     sources: NDArray[np.uint8] | None = None
     landmarks: NDArray[np.float64] | None = None
+    people: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,7 @@ class Estimate:
         joints: (J, 3) joint centres, metres. Pose and joints are NaN before anybody is tracked.
         status: "tracked", "initialised", "recovered", "lost", "suspect" (by the camera monitor), or "absent" (by the
             run: nobody is there).
+        reason: why it is lost, suspect or without sigma: a :class:`~tk.trackers.judgement.Reason`, 0 if it is not.
         objective: the objective's final value; of contour trackers E_S, mean over the views.
         iterations: (S,) optimiser iterations by stage; for ``search`` 1 if limbs were searched, else 0.
         timing: seconds by stage.
@@ -74,6 +78,10 @@ class Estimate:
             cameras left out included; None likewise.
         mask_source: (C,) uint8, as ``Frame.sources``.
         landmarks: (C, L, 3) those of this person among ``Frame.landmarks``; None if there are none.
+        cameras: (C,) uint8, which cameras were left out, and why: indices in :data:`~tk.trackers.judgement.STATES`.
+            None before anybody is tracked.
+        shift: (C,) by which share of its longer side each image has moved since the first frame; NaN if unknown. None
+            before anybody is tracked.
         frame, time: the frame's number in the capture, and seconds; whoever steps the tracker knows them.
         person: the person's number in the run.
     """
@@ -91,6 +99,9 @@ class Estimate:
     drawn: NDArray[np.bool_] | None = None
     mask_source: NDArray[np.uint8] | None = None
     landmarks: Float | None = None
+    reason: int = 0
+    cameras: NDArray[np.uint8] | None = None
+    shift: Float | None = None
     frame: int = -1
     time: float = 0.0
     person: int = 0
@@ -179,6 +190,11 @@ class SharingTracker(Tracker, Protocol):
 
     choice: RayGrid
     screen: RayGrid
+
+    def sighted(self, landmarks: Float) -> RenderedBody | None:
+        """Return an average body on the grid :attr:`choice`, at the pose that a person's landmarks (C, L, 3) show; None
+        if no two images agree on them."""
+        ...
 
     def rendered(self, ahead: bool) -> RenderedBody:
         """Return the body on the grid, with its colours: at the last pose, or at the one expected in the next frame."""

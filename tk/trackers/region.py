@@ -55,6 +55,7 @@ from tk.trackers.hypotheses import (
     disagreement,
     walking,
 )
+from tk.trackers.judgement import UNKNOWN_AFTER
 from tk.trackers.proposals import exchanged, limbs
 from tk.trackers.proposals import landmarks as of_landmarks
 from tk.trackers.proposals import opposite as of_heading
@@ -79,8 +80,6 @@ PLAIN = 0.25
 # development captures; half and twice the value change the mean errors of dance and cube (50 frames) by 0.04 cm at
 # most (angle) and 0.01 cm (translation).
 ANGLE_DEG, TRANSLATION_M = 40.0, 0.3
-# After this many consecutive frames with a high residual, and two failed searches for the person, sigma is set to NaN.
-UNKNOWN_AFTER = 2 * RECOVER_EVERY
 # Masks are searched for carried objects if this share of their pixels has colours that are not the person's; objects
 # narrower than six pixels are ignored.
 FOREIGN_SHARE = 0.01
@@ -227,9 +226,9 @@ class RegionTracker(ContourTracker[RegionState]):
         deviation = STATURE_DEVIATION if height_m else STATURE
         trackers, costs = (self.with_cameras(self.rig), self.with_cameras(self.rig)), []
         for tracker, one in zip(trackers, both.swapaxes(0, 1), strict=True):
-            body, fitted = self.fit(seen, one, np.arange(len(seen)), stature, deviation)
-            tracker.take_body(body)
-            costs.append(tracker.cost(masks, self.world.poses_out(fitted), landmarks))
+            fitted = self.fit(seen, one, np.arange(len(seen)), stature, deviation)
+            tracker.take_body(fitted.body)
+            costs.append(tracker.cost(masks, self.world.poses_out(fitted.poses), landmarks))
         return trackers if costs[1] < costs[0] + DROPPED else ()
 
     def step(self, frame: Frame) -> Estimate:
@@ -265,7 +264,8 @@ class RegionTracker(ContourTracker[RegionState]):
             look = self._look(seen)
         misplaced = self.misplaced(evidence, look.label)
         searched = self._needs_search(frame, look, misplaced, evidence.hidden(look.label))
-        best, proposed = self._best.pose, [of_landmarks.propose(self, seen)]
+        best = self._best.pose
+        proposed = [of_landmarks.propose(self, seen, best)]
         if searched:
             proposed += [limbs.propose(self, seen, best, misplaced), exchanged.propose(self, seen, best)]
             proposed.append(of_heading.propose(self, seen, best))
@@ -432,7 +432,7 @@ class RegionTracker(ContourTracker[RegionState]):
             return
         if self.config.colors and evidence.bins is not None and self.residuals.mean_excess(look.error) <= 0:
             self.colors.learn(evidence.bins[evidence.person], look.label[evidence.person])
-        self.residuals.learn(look.error)
+        self.residuals.learn(look.residual)
 
     def _look(self, seen: Seen) -> _Look:
         """Return how the best pose explains the frame."""

@@ -39,8 +39,6 @@ OUTLIER = 5.0
 # 0.126 in the median of a recording, at most 0.20 over RECENT frames. Another recording's calibration gives 0.25 to
 # 0.6; two of five cameras turned by 3 degrees give 0.15 to 0.6.
 LEVEL, LEVEL_SPREAD, RECENT = 0.091, 0.264, 5
-# Keeps the logarithm finite where a body fits perfectly; a hundredth of the level.
-_TINY = 1e-3
 
 
 def displacements(residual: Float) -> Float:
@@ -66,28 +64,9 @@ def variance_factor(residual: Float) -> Float:
     return np.asarray(np.fmax(displacement(residual) / LEVEL, 1.0) ** 2)
 
 
-def contradicted(residual: Float, false_alarm: float) -> NDArray[np.bool_]:
-    """Return (F,) whether residuals (F, V, 2) of consecutive frames contradict the poses: the frame is among
-    :data:`RECENT` ones whose mean displacement is far above :data:`LEVEL`.
-
-    Half of the logarithm's variance lies between recordings, so all frames of a recording with a high level would count
-    as contradicted. The limit is therefore set for the probability ``false_alarm`` squared.
-    """
-    log = np.log(displacement(residual) + _TINY)
-    measured = np.flatnonzero(np.isfinite(log))
-    result = np.zeros(len(residual), np.bool_)
-    if len(measured):
-        window = min(RECENT, len(measured))
-        mean = np.convolve(log[measured], np.full(window, 1.0 / window), "valid")
-        limit = np.log(LEVEL) - LEVEL_SPREAD * NormalDist().inv_cdf(false_alarm**2)
-        for first in np.flatnonzero(mean > limit):
-            result[measured[first : first + window]] = True
-    return result
-
-
 @dataclass(frozen=True)
 class BaselineState:
-    """(V,) mean and spread of E_S in each view, and the number of frames without a high residual."""
+    """Of V views: mean (V, 2) of both areas, spread (V,) of E_S, and the number of frames without a high residual."""
 
     mean: Float
     spread: Float
@@ -103,28 +82,34 @@ class ResidualBaseline(Stateful[BaselineState]):
 
     Attributes:
         threshold: the excess, in spreads, that a normal variable exceeds with this probability.
-        mean, spread: (V,) of E_S; the mean is NaN for a view that has seen nobody yet.
+        mean: (V, 2) of missing and surplus area; NaN for a view that has seen nobody yet.
+        spread: (V,) of E_S.
     """
 
     State = BaselineState
 
     def __init__(self, views: int, false_alarm: float) -> None:
         self.threshold = NormalDist().inv_cdf(1.0 - false_alarm)
-        self.mean, self.spread = np.full(views, np.nan), np.full(views, START_SPREAD)
+        self.mean, self.spread = np.full((views, 2), np.nan), np.full(views, START_SPREAD)
         self._frames = np.zeros(views, np.int64)  # without a high residual, by view
 
     def excess(self, error: Float) -> Float:
-        """Return (V,) by how many spreads E_S (V,) exceeds the mean; NaN for a view that sees nobody."""
-        return np.asarray((error - self._means(error)) / self.spread)
+        """Return by how many spreads E_S (V,), or each area (V, 2), exceeds its mean; NaN for a view without
+        anybody."""
+        spread = self.spread if error.ndim == 1 else self.spread[:, None]
+        return np.asarray((error - self._means(error)) / spread)
 
     def _means(self, error: Float) -> Float:
-        """Return (V,) the means. A view without a baseline gets the median of the others, and in the first frame the
-        median of E_S, because a camera that is wrong from the start must not become its own baseline."""
-        known = np.isfinite(self.mean)
-        if known.all():
-            return self.mean
-        others = self.mean[known] if known.any() else error[np.isfinite(error)]
-        return np.where(known, self.mean, np.median(others) if len(others) else np.nan)
+        """Return the means of E_S (V,), or of each area (V, 2). A view without a baseline gets the median of the
+        others, and in the first frame the median of the residuals, because a camera that is wrong from the start must
+        not become its own baseline."""
+        mean = self.mean if error.ndim == 2 else self.mean.sum(axis=1)
+        known, seen = np.isfinite(self.mean[:, 0]), np.isfinite(error.reshape(len(error), -1)[:, 0])
+        if known.all() or not (known.any() or seen.any()):
+            return mean
+        mean = mean.copy()
+        mean[~known] = np.median(mean[known] if known.any() else error[seen], axis=0)
+        return mean
 
     def mean_excess(self, error: Float) -> float:
         """Return the mean excess of the views that see anybody, each at most :data:`OUTLIER`; inf if none does."""
@@ -143,18 +128,23 @@ class ResidualBaseline(Stateful[BaselineState]):
         seen = np.isfinite(excess)
         return bool(seen.any() and (excess[seen] > OUTLIER).all())
 
-    def learn(self, error: Float) -> None:
-        """Update the baseline with a frame's E_S (V,). It counts as one spread above the mean at most, so that a wrong
-        pose does not become the baseline soon."""
+    def learn(self, residual: Float) -> None:
+        """Update the baseline with a frame's residual (V, 2). E_S counts as one spread above the mean at most, so that
+        a wrong pose does not become the baseline soon."""
+        error = residual.sum(axis=1)
         seen = np.isfinite(error)
-        mean = self._means(error)
-        deviation = np.minimum(error - mean, self.spread)
+        mean = self._means(residual)
+        deviation = residual - mean
+        rise = deviation.sum(axis=1)
+        high = rise > self.spread
+        deviation[high] *= (self.spread[high] / rise[high])[:, None]
         right = seen & (not self.high(error))
         rate = np.where(right, np.maximum(RATE, 1 / (2 + self._frames)), RATE)
         self._frames = self._frames + right
-        mean = mean + rate * deviation
+        mean = mean + rate[:, None] * deviation
         # a high residual is no sample of what is normal; it would widen the spread until it counts as normal itself.
         # 1.25: the mean absolute deviation of a normal variable is 0.8 standard deviations
-        spread = self.spread + RATE * (1.25 * np.abs(deviation) - self.spread)
-        self.mean = np.where(seen, mean, self.mean)
-        self.spread = np.where(right, np.maximum(spread, np.maximum(LEAST_SPREAD, LEAST_SHARE * mean)), self.spread)
+        spread = self.spread + RATE * (1.25 * np.abs(np.minimum(rise, self.spread)) - self.spread)
+        least = np.maximum(LEAST_SPREAD, LEAST_SHARE * mean.sum(axis=1))
+        self.mean = np.where(seen[:, None], mean, self.mean)
+        self.spread = np.where(right, np.maximum(spread, least), self.spread)

@@ -103,6 +103,7 @@ class SecondPass:
         self.tracked = np.flatnonzero(~lost)
         self.poses, self.residual = poses.copy(), np.array(residual)
         self._variance = np.zeros((2, len(poses), len(JOINTS)))  # of the pose, and of the choice between two
+        self._body_variance: Float = np.zeros(len(JOINTS))
         self._done = 0
 
     @property
@@ -111,7 +112,7 @@ class SecondPass:
         skeleton, tracked = self.tracker.body.skeleton, self.tracked
         variance = self._variance.sum(axis=0)
         posture = np.median(directions(skeleton, self.poses[tracked]), axis=0)
-        variance[tracked] += posture_variance(skeleton, self.poses[tracked], posture)
+        variance[tracked] += posture_variance(skeleton, self.poses[tracked], posture) + self._body_variance
         return np.sqrt(variance)
 
     def fit_body(self, height_m: float | None) -> None:
@@ -123,8 +124,9 @@ class SecondPass:
         stature = height_m or tracker.body.dimensions.stature
         deviation = STATURE_DEVIATION if height_m else STATURE
         seen = [self._pyramid(i) for i in chosen]
-        body, _ = tracker.fit(seen, self.poses[chosen], np.arange(len(chosen)), stature, deviation)
-        tracker.take_body(body)
+        fitted = tracker.fit(seen, self.poses[chosen], np.arange(len(chosen)), stature, deviation)
+        tracker.take_body(fitted.body)
+        self._body_variance = fitted.variance
 
     def optimise(self, frames: NDArray[np.int64]) -> None:
         """Optimise frames near their present poses."""

@@ -13,7 +13,7 @@ unknown: pixels far from all bodies, and what has no colour of the bodies beside
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -25,6 +25,7 @@ from tk.kernels.line_search import COLOR_BINS, MOST_LOG_RATIO
 from tk.kernels.mask_values import OTHERS, PERSON
 from tk.kernels.raycast import FAR
 from tk.model.cameras.camera import Rig
+from tk.model.cues.landmarks import LEAST_OVERLAP
 from tk.model.cues.part_colors import RenderedBody, color_bins
 from tk.model.cues.ray_costs import RayGrid
 from tk.trackers.protocol import Frame
@@ -47,6 +48,8 @@ _AVERAGED_PX = 3
 # A view shows somebody unknown if a connected region that is not near has this share of a person's area. A fast arm
 # that is not where it is expected has 0.05. Hulls expect nothing.
 UNKNOWN, UNKNOWN_BY_HULLS = 0.1, 0.03
+# A network's masks of single people are further evidence: of a pixel, a person's mask is right with this probability.
+RIGHT_MASK = 0.95
 # Where somebody unknown ends is unknown, too: within this distance of the region, metres: half a trunk, and NEAR_M.
 _WIDTH_M = 0.35
 
@@ -138,6 +141,7 @@ def assign(
     owner = np.full(frame.masks.shape, NOBODY, np.int8)
     areas = [np.count_nonzero(body.label, axis=(1, 2)) for body in bodies if body is not None]
     least = unknown * float(np.median(areas)) if areas else 0.0
+    claims = _claims(grid, frame, bodies, shown)
     colored = frame.images.size > 0 and any(body is not None and body.log_likelihood is not None for body in bodies)
     for v, camera in enumerate(rig):
         cells = _around(shown[v])
@@ -149,18 +153,57 @@ def assign(
         ]
         if not shapes:
             continue
-        stranger = _stranger(shown[v][cells], shapes, cell, least)
-        view = _View(grid.step, shown[v][cells], [*shapes, *stranger])
+        own = {number: claim[v][cells] for number, claim in claims.items()}
+        stranger = _stranger(shown[v][cells], shapes, cell, least, own.get(NOBODY))
+        view = _View(grid.step, shown[v][cells], [*shapes, *stranger], own)
         pixels = _pixels(cells, grid.step)
         image = frame.images[v][pixels] if colored else None
         owner[v][pixels] = view.owners(frame.masks[v][pixels] >= PERSON, image)
     return PixelOwners(grid, owner, len(bodies))
 
 
-def _stranger(shown: Bool, shapes: Sequence[_Shape], cell: float, least: float) -> list[_Shape]:
+def _claims(grid: RayGrid, frame: Frame, bodies: Sequence[RenderedBody | None], shown: Bool) -> dict[int, Bool]:
+    """Return the cells (V, h, w) that a network's masks give to people, by number; to :data:`NOBODY` those of masks
+    that belong to no body, and to no other mask.
+    """
+    if frame.people is None:
+        return {}
+    bits = grid.sample(frame.people)
+    masks = [mask for mask in ((bits >> n & 1 > 0) & shown for n in range(8)) if mask.any()]
+    if len(masks) < 2:
+        return {}
+    whose = matched_bodies(masks, bodies)
+    claims = {k: masks[n] for n, k in whose.items()}
+    strange = np.zeros(shown.shape, np.bool_)
+    for n, mask in enumerate(masks):
+        if n not in whose:
+            strange |= mask
+    known = functools.reduce(np.logical_or, claims.values(), np.zeros(shown.shape, np.bool_))
+    return claims | {NOBODY: strange & ~known}
+
+
+def matched_bodies(masks: Sequence[Bool], bodies: Sequence[RenderedBody | None]) -> dict[int, int]:
+    """Return the bodies that masks (V, h, w) belong to, by the numbers of both: each overlaps most with the other."""
+    overlap = np.zeros((len(masks), len(bodies)))
+    for k, body in enumerate(bodies):
+        for n, mask in enumerate(masks if body is not None else ()):
+            assert body is not None
+            both, either = mask & (body.label > 0), mask | (body.label > 0)
+            overlap[n, k] = np.count_nonzero(both) / max(int(np.count_nonzero(either)), 1)
+    if not overlap.size:
+        return {}
+    best = {n: int(np.argmax(overlap[n])) for n in range(len(masks)) if overlap[n].max() >= LEAST_OVERLAP}
+    return {n: k for n, k in best.items() if int(np.argmax(overlap[:, k])) == n}
+
+
+def _stranger(
+    shown: Bool, shapes: Sequence[_Shape], cell: float, least: float, strange: Bool | None = None
+) -> list[_Shape]:
     """Return somebody unknown, at an unknown depth, if at least ``least`` connected cells of a mask (h, w) are far from
-    all shapes."""
+    all shapes, or ``strange``: claimed by a network's mask of somebody unknown."""
     far = shown & (_nearest(shapes) > NEAR_M)
+    if strange is not None:
+        far |= strange
     if np.count_nonzero(far) < least:
         return []
     _, region, stats, _ = cv2.connectedComponentsWithStats(far.view(np.uint8), connectivity=4)
@@ -181,11 +224,17 @@ class _View:
         step: pixels along an edge of a cell.
         shown: (h, w) bool, cells of the mask.
         shapes: the bodies.
+        claims: of people, by number, the cells (h, w) that a network's masks give to them.
     """
 
-    def __init__(self, step: int, shown: Bool, shapes: Sequence[_Shape]) -> None:
+    def __init__(self, step: int, shown: Bool, shapes: Sequence[_Shape], claims: Mapping[int, Bool]) -> None:
         self._step, self._shown, self._shapes = step, shown, shapes
         self._visible = _log_visible(shapes)
+        # a mask speaks for its person where it is, and against where it is not
+        ratio = np.float32(2 * np.log(RIGHT_MASK / (1 - RIGHT_MASK)))
+        for shape, visible in zip(shapes, self._visible, strict=True):
+            if shape.number in claims:
+                visible += ratio * claims[shape.number]
 
     def owners(self, person: Bool, image: NDArray[np.uint8] | None) -> NDArray[np.int8]:
         """Return (H, W) the owners of pixels, by the colours where the bodies alone do not decide.

@@ -189,6 +189,7 @@ def test_without_hard_links(path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 FULL = """
 import sys
 from pathlib import Path
+import numpy as np
 from tests.io.result_files import append, make_smoothed
 from tests.io.result_victim import META
 from tk.errors import ResultError, TkError
@@ -204,7 +205,7 @@ try:
 except ResultError as error:
     print(error, file=sys.stderr)
 try:
-    revise_result(path, smoothed=make_smoothed(len(read_result(path))))
+    revise_result(path, smoothed=make_smoothed(len(read_result(path))), model={"larger": np.ones(2**17)})
 except ResultError as error:
     print(error, file=sys.stderr)
 Path(sys.argv[2]).write_bytes(path.read_bytes())

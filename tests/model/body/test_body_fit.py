@@ -19,7 +19,7 @@ from tk.model.body.body_parameters import BodyFamily, shape_rows
 from tk.model.body.body_points import LANDMARKS
 from tk.model.body.cone_body import SHAPE_NUMBERS, build_cone_body
 from tk.model.body.gait_poses import standing_pose, walking_pose
-from tk.model.body.skeleton import SEGMENTS
+from tk.model.body.skeleton import JOINTS, SEGMENTS
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Views
 
@@ -121,7 +121,7 @@ def test_dimension_rows_equal_finite_differences():
 def test_landmark_rows_equal_finite_differences():
     mean = FAMILY.mean
     shared = mean + np.random.default_rng(3).normal(0, 0.02, len(mean)) * (FAMILY.deviation > 1e-5)
-    rows = FAMILY.landmark_rows(shared, FAMILY.build(shared), POSE)
+    rows = FAMILY.landmark_rows(shared, POSE)
     assert rows.shape == (len(LANDMARKS), 3, len(mean))
     for k, step in enumerate(1e-5 * np.eye(len(mean))):
         pair = [body_points(FAMILY.build(shared + sign * step), POSE) for sign in (1, -1)]
@@ -158,7 +158,7 @@ def test_lengths_of_a_known_body_are_recovered(monkeypatch):
     body = build_cone_body(true)
     poses = walk(body, 4)
     start = poses + np.random.default_rng(0).normal(0, 0.01, poses.shape)
-    found, fitted = fit_body(VIEWS, pyramids_of(body, poses), start, SEARCH, true.stature)
+    found, fitted, _ = fit_body(VIEWS, pyramids_of(body, poses), start, SEARCH, true.stature)
     for name in ("thigh", "calf", "upper_arm", "forearm"):
         assert getattr(found.dimensions, name) == pytest.approx(getattr(true, name), rel=0.02), name
     off = [
@@ -177,7 +177,7 @@ def test_landmarks_show_joints_that_silhouettes_of_straight_limbs_do_not():
     (silhouettes,) = pyramids_of(body, pose[None])
     ratio = []
     for landmarks in (None, landmarks_of(VIEWS.rig, body, pose)):
-        found, _ = fit_body(VIEWS, [replace(silhouettes, landmarks=landmarks)], pose[None], SEARCH, STATURE)
+        found, _, _ = fit_body(VIEWS, [replace(silhouettes, landmarks=landmarks)], pose[None], SEARCH, STATURE)
         ratio.append(found.dimensions.upper_arm / found.dimensions.forearm)
     true = body.dimensions.upper_arm / body.dimensions.forearm
     # a little, because the landmarks' offsets of some centimetres are unknown
@@ -193,7 +193,7 @@ def test_shapes_are_recovered_as_mirror_images():
     true = AVERAGE.reshaped(change)
     poses = walk(true, 3)
     seen = pyramids_of(true, poses)
-    found, fitted = fit_body(VIEWS, seen, poses, SEARCH, STATURE)
+    found, fitted, _ = fit_body(VIEWS, seen, poses, SEARCH, STATURE)
     grid = RayGrid(VIEWS.rig, 150)
 
     def error(body, poses):
@@ -231,3 +231,12 @@ def test_ends_of_a_part_move_separately_and_mirrored():
     for a, b in zip(same.parts, AVERAGE.parts, strict=True):
         assert a.shape == b.shape
         np.testing.assert_allclose(a.T_body_part, b.T_body_part, atol=1e-12)
+
+
+def test_variance_by_the_body_falls_with_the_frames_and_knows_depth() -> None:
+    """A body that one frame shows is less certain than one that six different frames show."""
+    poses = walk(AVERAGE, 6)
+    seen = pyramids_of(AVERAGE, poses)
+    one, six = (fit_body(VIEWS, seen[:n], poses[:n], SEARCH, STATURE).variance for n in (1, 6))
+    assert one.shape == (len(JOINTS),) and (six < one).all()
+    assert 0.003 < np.sqrt(one.mean()) < 0.02

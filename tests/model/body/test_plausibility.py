@@ -29,13 +29,13 @@ def test_walking_turning_jumping_and_sprinting_are_possible() -> None:
 
 
 @pytest.mark.parametrize(
-    ("then", "reason"), [(joints(x=3.0), "jumps"), (joints() * np.nan, "no numbers")], ids=["a jump", "NaN"]
+    ("then", "reason"), [(joints(x=3.0), "JUMPS"), (joints() * np.nan, "NO_NUMBERS")], ids=["a jump", "NaN"]
 )
 def test_impossible_pose_has_a_reason(then: np.ndarray, reason: str) -> None:
     judge = Plausibility(15.0)
     assert judge.judge(0, joints()) is None
     told = judge.judge(1, then)
-    assert told is not None and reason in told
+    assert told == reason
     assert judge.judge(2, joints()) is None, "it was the estimate that was wrong, not what came before"
 
 

@@ -20,9 +20,9 @@ NETWORK_M = 0.03  # error of a network's landmarks
 POSES = walk(3)
 
 
-def with_turned(rig: Rig, c: int, degrees: float) -> Rig:
-    """Return the rig whose camera c is turned about the vertical axis of its image."""
-    turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+def with_turned(rig: Rig, c: int, degrees: float, axis: str = "y") -> Rig:
+    """Return the rig whose camera c is turned about an axis of its image: x is horizontal, y vertical."""
+    turn = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
     cameras = list(rig)
     cameras[c] = replace(rig[c], rotation=turn @ rig[c].rotation, translation=turn @ rig[c].translation)
     return Rig(tuple(cameras))
@@ -49,9 +49,15 @@ def test_frames_of_an_opening_count_as_one() -> None:
     np.testing.assert_allclose(evidence_for_cameras(RIG, one * 4), evidence_for_cameras(RIG, one))
 
 
-def test_cameras_with_fewer_than_two_others_have_no_evidence() -> None:
-    two = Rig(tuple(RIG)[:2])
-    assert np.isnan(evidence_for_cameras(two, [one[:, :2] for one in seen()])).all()
+def test_two_cameras_confirm_or_contradict_each_other() -> None:
+    own = [one[:, :2] for one in seen()]
+    assert (evidence_for_cameras(Rig(tuple(RIG)[:2]), own) > 3.0).all()
+    tilted = tuple(with_turned(RIG, 0, 10.0, "x"))[:2]  # turned about the vertical they agree on another place
+    assert (evidence_for_cameras(Rig(tilted), own) < 0.0).all()
+
+
+def test_cameras_that_others_cannot_test_have_no_evidence() -> None:
+    assert np.isnan(evidence_for_cameras(Rig(tuple(RIG)[:1]), [one[:, :1] for one in seen()])).all()
     blind = [one.copy() for one in seen()]
     for one in blind:
         one[:, 3] = np.nan

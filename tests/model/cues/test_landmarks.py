@@ -16,7 +16,6 @@ from tk.model.body.skeleton import JOINTS
 from tk.model.cues.landmarks import (
     EXCHANGED,
     INDEPENDENT,
-    JOINT_LANDMARKS,
     LANDMARKS,
     OFFSET_M,
     SEEN_M,
@@ -160,18 +159,25 @@ def test_hidden_landmarks_count_less() -> None:
 @pytest.mark.parametrize("heading", ["true", "turned"])
 def test_pose_of_the_landmarks_is_proposed(heading: str) -> None:
     pose = POSE if heading == "true" else TURNED
-    (found,) = propose(RIG, BODY.skeleton, landmarks_of(RIG, BODY, pose, 0.02))
+    found = propose(RIG, BODY, landmarks_of(RIG, BODY, pose, 0.02), pose[:3] + 0.2)[0]
     assert np.linalg.norm(BODY.skeleton.joints(found) - BODY.skeleton.joints(pose), axis=1).mean() < 0.05
 
 
-def test_few_landmarks_propose_no_pose() -> None:
-    few = np.full(SEEN.shape, np.nan)
-    rows = [LANDMARKS.index(name) for name in JOINT_LANDMARKS[:5]]
-    few[:, rows] = SEEN[:, rows]
-    assert propose(RIG, BODY.skeleton, few).shape == (0, len(POSE))
-    alone = np.full(SEEN.shape, np.nan)
-    alone[0] = SEEN[0]
-    assert propose(RIG, BODY.skeleton, alone).shape == (0, len(POSE))
+def test_proposed_poses_are_sorted_and_ignore_an_image_that_shows_somebody_else() -> None:
+    seen = landmarks_of(RIG, BODY, POSE, 0.02)
+    seen[0, :, :2] += 80.0
+    found = propose(RIG, BODY, seen, POSE[:3])
+    assert np.linalg.norm(BODY.skeleton.joints(found[0]) - BODY.skeleton.joints(POSE), axis=1).mean() < 0.06
+    scores = LandmarkCue(RIG, BODY, seen).score(found)
+    assert (np.diff(scores) >= 0).all()
+
+
+def test_landmarks_of_a_seated_person_propose_a_seated_pose() -> None:
+    seated = POSE.copy()
+    for side in ("l", "r"):
+        seated[NAMES.index(f"hip_{side}_pitch")], seated[NAMES.index(f"knee_{side}_flexion")] = -1.8, 2.2
+    found = propose(RIG, BODY, landmarks_of(RIG, BODY, seated, 0.02), POSE[:3])[0]
+    assert np.linalg.norm(BODY.skeleton.joints(found) - BODY.skeleton.joints(seated), axis=1).mean() < 0.05
 
 
 def test_contradicted_joints_get_variance_and_others_none() -> None:

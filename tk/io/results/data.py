@@ -87,6 +87,8 @@ class ResultMeta:
     residual_cameras: tuple[str, ...] = ()  # names of the C cameras of `/residual` and `/mask_source`
     landmark_names: tuple[str, ...] = ()  # names of the L landmarks; empty if no network sees landmarks
     mask_sources: tuple[str, ...] = ()  # meanings of the values of `/mask_source`; empty if no segmenter makes masks
+    reasons: tuple[str, ...] = ()  # meanings of the values of `/evidence/reason`
+    camera_states: tuple[str, ...] = ()  # meanings of the values of `/evidence/camera`
     segment_names: tuple[str, ...] = ()  # names of the segments of `/segments/rotation`
     feet: bool = False  # True if `/feet/position` exists, the points `tk.model.body.joints.FOOT_POINTS`
     angles: tuple[JointAngles, ...] = ()  # the clinical joint angles of `/angles`
@@ -200,6 +202,9 @@ class Result:
     mask_source: NDArray[np.uint8] | None = None  # (F, C), meanings in meta.mask_sources
     # (F, C, L, 3) x, y, pixels of the recorded images, and visibility; NaN where no network was asked
     landmarks: NDArray[np.float32] | None = None
+    reason: NDArray[np.uint8] | None = None  # (F,) why a frame is lost, suspect or without sigma, see meta.reasons
+    camera_state: NDArray[np.uint8] | None = None  # (F, C) why a camera was left out, see meta.camera_states; 0: used
+    image_shift: NDArray[np.float32] | None = None  # (F, C) how far each image has moved, share of its longer side
     residual: Float | None = None  # (F, C, 2) missing and surplus area, shares of the person's pixels
     segments_rotation: Float | None = None  # (F, S, 4) w, x, y, z; segment to world
     feet: Float | None = None  # (F, 4, 3) metres

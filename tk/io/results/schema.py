@@ -136,6 +136,19 @@ ROWS = (
         "visibility; NaN where the network was not asked",
         {"names": "landmark_names", "cameras": "residual_cameras"}, field="landmarks", optional="landmark_names",
     ),
+    Dataset(
+        "evidence/reason", "F", "uint8", "why the frame is lost, suspect or without sigma",
+        {"meaning": "reasons"}, field="reason", optional="reasons",
+    ),
+    Dataset(
+        "evidence/camera", "F C", "uint8", "the cameras that were left out of the frame, and why; 0: used",
+        {"cameras": "residual_cameras", "meaning": "camera_states"}, field="camera_state", optional="camera_states",
+    ),
+    Dataset(
+        "evidence/shift", "F C", "float32",
+        "by which share of its longer side the image has moved since the first frame; NaN if unknown",
+        {"cameras": "residual_cameras"}, field="image_shift", optional="camera_states",
+    ),
     Dataset("iterations", "F T", "int32", "optimiser iterations by stage", {"stages": "stages"}, field="iterations"),
     Dataset(
         "timing/<stage>", "F", "float64", "seconds by stage; `total` is the frame's share of the wall time",

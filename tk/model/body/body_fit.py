@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,15 @@ from tk.model.block_least_squares import minimise
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_parameters import BodyFamily
 from tk.model.body.cone_body import ConeBody
-from tk.model.cameras.bundle import INFORMATION, LONGEST_STEP, SPACING_PX, BundleFrame, ContourBundle
+from tk.model.cameras.bundle import (
+    INFORMATION,
+    LONGEST_STEP,
+    SEGMENT_M,
+    SPACING_PX,
+    BundleFrame,
+    BundleState,
+    ContourBundle,
+)
 from tk.model.masks.silhouettes import Pyramid, Views
 
 Float = NDArray[np.float64]
@@ -32,6 +41,21 @@ STATURE_DEVIATION = 0.01
 ROUNDS = 6
 
 
+class FittedBody(NamedTuple):
+    """A body fitted to F frames.
+
+    Attributes:
+        body: the body.
+        poses: (F, D) in the frames.
+        variance: (J,) of the joints' positions along an axis, metres², that the body's uncertainty causes, mean over
+            the frames.
+    """
+
+    body: ConeBody
+    poses: Float
+    variance: Float
+
+
 def fit_body(
     views: Views,
     pyramids: Sequence[Pyramid],
@@ -39,7 +63,7 @@ def fit_body(
     settings: SearchSettings,
     stature_m: float,
     stature_deviation: float = STATURE_DEVIATION,
-) -> tuple[ConeBody, Float]:
+) -> FittedBody:
     """Fit a body and poses to several frames.
 
     Args:
@@ -49,18 +73,35 @@ def fit_body(
         settings: of the edge search.
         stature_m: the subject's height without shoes, given or estimated, metres.
         stature_deviation: prior standard deviation of the logarithm of the stature about ``stature_m``.
-
-    Returns:
-        The body, and poses (F, D).
     """
-    bundle = ContourBundle(
-        BodyFamily(BodyDimensions.from_stature(stature_m), stature_deviation),
-        views.rig,
-        [BundleFrame(pyramid, pose, np.zeros_like(pose)) for pyramid, pose in zip(pyramids, poses, strict=True)],
-        replace(settings, spacing_px=SPACING_PX),
-        {},
-        INFORMATION / max(len(poses) / INFORMATIVE_FRAMES, 1.0),
-        segment_m=None,
-    )
-    state = minimise(bundle.start, bundle.linearise, bundle.move, [0] * ROUNDS, LONGEST_STEP).state
-    return bundle.family.build(state.body), state.poses
+
+    def bundle(segment_m: float | None) -> ContourBundle:
+        return ContourBundle(
+            BodyFamily(BodyDimensions.from_stature(stature_m), stature_deviation),
+            views.rig,
+            [BundleFrame(pyramid, pose, np.zeros_like(pose)) for pyramid, pose in zip(pyramids, poses, strict=True)],
+            replace(settings, spacing_px=SPACING_PX),
+            {},
+            INFORMATION / max(len(poses) / INFORMATIVE_FRAMES, 1.0),
+            segment_m=segment_m,
+        )
+
+    stiff = bundle(None)
+    state = minimise(stiff.start, stiff.linearise, stiff.move, [0] * ROUNDS, LONGEST_STEP).state
+    return FittedBody(stiff.family.build(state.body), state.poses, _joint_variance(bundle(SEGMENT_M), state))
+
+
+def _joint_variance(bundle: ContourBundle, state: BundleState) -> Float:
+    """Return (J,) variance of the joints' positions along an axis, metres², that the uncertainty of the body causes.
+
+    The pose adapts to the body: another thigh moves the knee, and hip and shank with it. Segments are free by SEGMENT_M
+    in each frame, because no joint is a hinge and clothes hide the bones: without that the contours of one frame would
+    determine the body to millimetres.
+    """
+    family, reduced = bundle.family, bundle.linearise(state, 0).reduced()
+    skeleton = family.build(state.body).skeleton
+    by_pose = skeleton.joint_jacobian(state.poses)  # (F, J, 3, D)
+    response = reduced.response[:, : by_pose.shape[-1]]
+    moved = family.joint_rows(state.body, state.poses) - by_pose @ response[:, None]
+    spread = moved @ np.linalg.inv(reduced.hessian)
+    return np.asarray((spread * moved).sum(axis=(-1, -2)).mean(axis=0) / 3)

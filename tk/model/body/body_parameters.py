@@ -7,6 +7,7 @@ along an occluding contour the surface slides in the image's tangent only.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -103,14 +104,21 @@ class BodyFamily:
         twists = np.concatenate(s.twists(poses), axis=-1).swapaxes(-1, -2)
         return LinearisedBody(body, s.segment_transforms(poses), twists, by_part.transpose(1, 2, 0), moves)
 
-    def landmark_rows(self, shared: Float, body: ConeBody, pose: Float) -> Float:
+    def landmark_rows(self, shared: Float, pose: Float) -> Float:
         """Return the derivatives (L, 3, K) of the points that landmarks mark by the parameters (K,), at a pose (D,)."""
-        step = _STEP * np.eye(len(DIMENSIONS))
-        dimensions = [BodyDimensions.of(np.exp(shared[: len(DIMENSIONS)] + row)) for row in step]
-        moved = np.array([build_skeleton(d).points(pose, SEGMENT, places(d)) for d in dimensions])
-        rows = np.zeros((*moved.shape[1:], len(shared)))
-        now = build_skeleton(body.dimensions).points(pose, SEGMENT, places(body.dimensions))
-        rows[..., : len(DIMENSIONS)] = ((moved - now) / _STEP).transpose(1, 2, 0)
+        return self._rows(shared, lambda d: build_skeleton(d).points(pose, SEGMENT, places(d)))
+
+    def joint_rows(self, shared: Float, poses: Float) -> Float:
+        """Return the derivatives (F, J, 3, K) of the joints by the parameters (K,), at poses (F, D)."""
+        return self._rows(shared, lambda d: build_skeleton(d).joints(poses))
+
+    def _rows(self, shared: Float, points: Callable[[BodyDimensions], Float]) -> Float:
+        """Return the derivatives (..., K) of points that depend on the dimensions by the parameters (K,)."""
+        logarithms = shared[: len(DIMENSIONS)]
+        now = points(BodyDimensions.of(np.exp(logarithms)))
+        rows = np.zeros((*now.shape, len(shared)))
+        for k, step in enumerate(_STEP * np.eye(len(DIMENSIONS))):
+            rows[..., k] = (points(BodyDimensions.of(np.exp(logarithms + step))) - now) / _STEP
         return rows
 
     def add_prior(self, shared: Float, H: Float, g: Float) -> None:

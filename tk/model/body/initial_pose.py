@@ -61,27 +61,18 @@ def pose_of_joints(skeleton: Skeleton, rows: NDArray[np.int64], targets: Float) 
 
     The best of several headings is returned.
     """
-    rest = neutral_pose(skeleton)
-    hanging = shoulder_angles(np.array([0.0, 0.2, -0.98]))
-    for shoulder, hip in zip(SHOULDERS, HIPS, strict=True):  # arms down, legs together
-        rest[[skeleton.index(f"{shoulder}_{angle}") for angle in ("yaw", "pitch")]] = hanging
-        rest[skeleton.index(f"{hip}_yaw")] = 0.0
-    seated = rest.copy()  # from a straight leg a folded one is not reached
-    for hip, knee in zip(HIPS, (LIMBS[leg][1] for leg in ("leg_l", "leg_r")), strict=True):
-        seated[skeleton.index(f"{hip}_pitch")], seated[skeleton.index(f"{knee}_flexion")] = -np.pi / 2, np.pi / 2
-    start = np.repeat(np.stack([rest, seated]), _HEADINGS, 0)
-    start[:, skeleton.index("torso_yaw")] = np.tile(np.arange(_HEADINGS) * 2 * np.pi / _HEADINGS, 2)
-    for pose in start:
-        pose[:3] = targets.mean(axis=0) - skeleton.joints(rest)[rows].mean(axis=0)
+    start = figures(skeleton, np.zeros(3))
+    start[:, :3] += targets.mean(axis=0) - skeleton.joints(start[0])[rows].mean(axis=0)
+    D = start.shape[1]
     precision = np.where(skeleton.prismatic, 0.0, _ANGLE**-2.0)
     weight = np.full(3 * len(rows), _JOINT_M**-2.0)
 
     def linearise(poses: Float, _: int) -> Equations:
-        found = Equations(len(poses), len(rest), 0)
+        found = Equations(len(poses), D, 0)
         for b, pose in enumerate(poses):
-            J = skeleton.joint_jacobian(pose)[rows].reshape(-1, len(rest))
+            J = skeleton.joint_jacobian(pose)[rows].reshape(-1, D)
             missing = targets - skeleton.joints(pose)[rows]
-            found.add(b, [slice(0, len(rest))], J, weight, missing.ravel())
+            found.add(b, [slice(0, D)], J, weight, missing.ravel())
             found.add_block_prior(b, precision, start[b] - pose)
             excess = skeleton.clip(pose) - pose
             found.add_block_prior(b, np.where(excess != 0, _LIMIT, 0.0), excess)
@@ -93,6 +84,22 @@ def pose_of_joints(skeleton: Skeleton, rows: NDArray[np.int64], targets: Float) 
     distance = np.linalg.norm(skeleton.joints(poses)[:, rows] - targets, axis=2)
     cost = ((distance / _JOINT_M) ** 2).sum(axis=1) + (precision * (start - poses) ** 2).sum(axis=1)
     return np.asarray(poses[np.argmin(cost)])
+
+
+def figures(skeleton: Skeleton, p_pelvis: Float) -> Float:
+    """Return poses (B, D) to begin from, standing and seated at several headings, with the pelvis at a point (3,)."""
+    rest = neutral_pose(skeleton)
+    hanging = shoulder_angles(np.array([0.0, 0.2, -0.98]))
+    for shoulder, hip in zip(SHOULDERS, HIPS, strict=True):  # arms down, legs together
+        rest[[skeleton.index(f"{shoulder}_{angle}") for angle in ("yaw", "pitch")]] = hanging
+        rest[skeleton.index(f"{hip}_yaw")] = 0.0
+    seated = rest.copy()  # from a straight leg a folded one is not reached
+    for hip, knee in zip(HIPS, (LIMBS[leg][1] for leg in ("leg_l", "leg_r")), strict=True):
+        seated[skeleton.index(f"{hip}_pitch")], seated[skeleton.index(f"{knee}_flexion")] = -np.pi / 2, np.pi / 2
+    poses = np.repeat(np.stack([rest, seated]), _HEADINGS, 0)
+    poses[:, skeleton.index("torso_yaw")] = np.tile(np.arange(_HEADINGS) * 2 * np.pi / _HEADINGS, 2)
+    poses[:, :3] = p_pelvis
+    return poses
 
 
 def _stature_of(joints: dict[str, Float]) -> float | None:

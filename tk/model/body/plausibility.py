@@ -83,14 +83,15 @@ class Plausibility(Stateful[LastAccepted]):
         self._index = -1
 
     def judge(self, index: int, joints: Float) -> str | None:
-        """Return why the joints (J, 3), metres, of a frame are impossible; None if they are possible."""
+        """Return why the joints (J, 3), metres, of a frame are impossible, "NO_NUMBERS" or "JUMPS"; None if they are
+        possible."""
         if not np.isfinite(joints).all():
-            return "it has joints that are no numbers"
+            return "NO_NUMBERS"
         if self._joints is not None:
             dt = max(index - self._index, 1) / self._fps
             moved = float(np.linalg.norm(joints[_TRUNK, :] - self._joints[_TRUNK, :], axis=1).min())
             if moved > FASTEST_M_S * dt + TRUNK_ERROR_M:
-                return "it jumps"
+                return "JUMPS"
         self._joints, self._index = joints, index
         return None
 

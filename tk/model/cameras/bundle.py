@@ -209,7 +209,7 @@ class ContourBundle:
             difference, excess = np.zeros(D), np.zeros(D)
             if frame.pyramid.landmarks is not None:
                 said = LandmarkCue(state.rig, linear.body, frame.pyramid.landmarks).rows(pose[None])
-                by_body = self.family.landmark_rows(state.body, linear.body, pose)
+                by_body = self.family.landmark_rows(state.body, pose)
                 hessian, gradient = said.normal_equations(np.concatenate([said.jacobian, by_body[None]], axis=-1))
                 unknowns = np.concatenate([np.arange(P), np.arange(D + S - K, D + S)])
                 found.add_normal(f, unknowns, seen * hessian[0], seen * gradient[0])

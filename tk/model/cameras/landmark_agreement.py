@@ -26,7 +26,9 @@ REACH_M = 1.0
 
 def evidence_for_cameras(rig: Rig, landmarks: Sequence[Float]) -> Float:
     """Return (C,) the logarithm of the likelihood ratio, nats, of each camera being right against being wrong; NaN
-    without landmarks of one person in it, and in two others that agree.
+    without landmarks of one person in it and in another one.
+
+    A camera is compared with the others that agree; if no two do, with the one that it fits best.
 
     Frames of an opening err alike, so they count as one: the mean over the frames is returned.
 
@@ -37,9 +39,7 @@ def evidence_for_cameras(rig: Rig, landmarks: Sequence[Float]) -> Float:
     total, count = np.zeros(len(rig)), np.zeros(len(rig))
     for people in landmarks:
         own = [_Pairs.of(_Sets.of(rig, seen)) for seen in people]
-        found = np.array(
-            [[pairs.fit_without(c, pairs.sets.of_cameras([c]))[0] for c in range(len(rig))] for pairs in own]
-        )
+        found = np.array([pairs.evidence() for pairs in own]).reshape(-1, len(rig))
         known = np.isfinite(found)
         total += np.where(known, found, 0.0).sum(axis=0)
         count += known.any(axis=0)
@@ -187,6 +187,15 @@ class _Pairs(NamedTuple):
             return Consensus(np.zeros(C, np.bool_), np.full((L, 3), np.nan), 0.0)
         best = int(np.argmax(support))
         return Consensus(fit[best] > 0, self.points[best], float(support[best]))
+
+    def evidence(self) -> Float:
+        """Return (C,) the logarithm of each camera's likelihood ratio by the others; NaN without another one."""
+        found = np.full(len(self.sets.known), np.nan)
+        for c in range(len(found)):
+            found[c] = self.fit_without(c, self.sets.of_cameras([c]))[0]
+            if np.isnan(found[c]) and (beside := self.fit[(self.pairs == c).any(axis=1), c]).size:
+                found[c] = np.fmax.reduce(beside)
+        return found
 
     def fit_without(self, but: int, shown: _Sets) -> Float:
         """Return (N,) the logarithm of the likelihood ratio of each of N sets in camera ``but`` showing the person whom

@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.mask_values import PERSON
-from tk.model.body.body_points import JOINT_LANDMARKS, LANDMARKS, POINTS, SEGMENT, places
+from tk.model.body.body_points import LANDMARKS, POINTS, SEGMENT, places
 from tk.model.body.cone_body import ConeBody
-from tk.model.body.initial_pose import pose_of_joints
+from tk.model.body.initial_pose import figures
 from tk.model.body.joints import HIPS, JOINTS, SHOULDERS, side_of
-from tk.model.body.skeleton import Skeleton
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.triangulation import triangulate_joints
 from tk.model.setup import AVERAGE_STATURE_M
@@ -48,8 +47,10 @@ ELSEWHERE = 0.02
 OFFSET_M = 0.02
 # Least visibility of landmarks whose box is compared with the box of a mask, and least overlap of both boxes.
 LEAST_VISIBLE, LEAST_OVERLAP = 0.2, 0.2
-# Joints that must be triangulated before they propose a pose: fewer leave a limb open.
-LEAST_PROPOSED = 6
+# A proposal minimises the landmarks' cost with standard deviations that are larger by these factors, one after the
+# other: a pose that is far away is attracted, too. A step changes no angle by more than LONGEST_STEP; angles that the
+# landmarks leave open stay near the figure from which it began, by OPEN_ANGLE, radians.
+WIDENED, LONGEST_STEP, OPEN_ANGLE = (16.0, 16.0, 16.0, 8.0, 8.0, 8.0, 4.0, 4.0, 2.0, 2.0, 1.0, 1.0), 0.6, 3.0
 # Weight of the landmarks in the contours' equations: these count the edgels of a segment as independent, but clothes
 # and wrong pieces of a mask displace all of them together. With 10 and 20, four real people have errors of 5.8 and 6.2
 # cm instead of 5.2 on average (docs/experiments.md).
@@ -94,16 +95,18 @@ class LandmarkCue:
         rig: the cameras.
         body: the person's body.
         seen: (V, L, 3) or (F, V, L, 3), x, y, pixels, and visibility; NaN if unknown. Of F frames: as many as poses.
+        widened: factor of the landmarks' standard deviations. If it exceeds 1, all images show the person.
     """
 
-    def __init__(self, rig: Rig, body: ConeBody, seen: Float) -> None:
+    def __init__(self, rig: Rig, body: ConeBody, seen: Float, widened: float = 1.0) -> None:
         self._rig, self._skeleton, self._seen = rig, body.skeleton, seen
+        self._elsewhere = float(np.log(ELSEWHERE)) if widened == 1.0 else -np.inf
         seen = _normalised(rig, seen)
         self._place = places(body.dimensions) @ body.skeleton.T_world_body.T
         size = body.dimensions.stature / AVERAGE_STATURE_M
         known = np.asarray(np.isfinite(seen).all(axis=-1))
         visibility = np.where(known, seen[..., 2], 0.0)
-        self._sigma = SEEN_M * size * HIDDEN ** (1.0 - visibility)  # (..., V, L)
+        self._sigma = widened * SEEN_M * size * HIDDEN ** (1.0 - visibility)  # (..., V, L)
         self._right = np.where(known, right_share(visibility), 0.0)
         self._at = np.where(known[..., None], seen[..., :2], 0.0)
         # what is hidden in the images is guessed in all of them alike
@@ -148,7 +151,7 @@ class LandmarkCue:
         total = np.logaddexp(*halves)
         straight = np.exp(halves[0] - total) @ _HALVES  # (B, V, L)
         image = total.sum(axis=-1) + np.log(1.0 - ELSEWHERE)  # (B, V)
-        image_total = np.logaddexp(image, np.log(ELSEWHERE))
+        image_total = np.logaddexp(image, self._elsewhere)
         shown = np.exp(image - image_total)[..., None]
         w_own = shown * straight * own_right / own_sigma**2
         w_other = shown * (1 - straight) * other_right / other_sigma**2
@@ -249,14 +252,21 @@ def contradiction(rig: Rig, body: ConeBody, pose: Float, seen: Float) -> Float:
     return np.array([by_name[joint] if joint in by_name else of(middle[joint]) for joint in JOINTS])
 
 
-def propose(rig: Rig, skeleton: Skeleton, seen: Float) -> Float:
-    """Return poses (B, D), none or one, whose joints are nearest to the triangulated landmarks (V, L, 3)."""
-    points, _ = triangulate_joints(rig, seen[:, [LANDMARKS.index(name) for name in JOINT_LANDMARKS]])
-    known = np.isfinite(points).all(axis=1)
-    if np.count_nonzero(known) < LEAST_PROPOSED:
-        return np.empty((0, len(skeleton.names)))
-    rows = np.array([JOINTS.index(name) for name in JOINT_LANDMARKS])
-    return pose_of_joints(skeleton, rows[known], points[known])[None]
+def propose(rig: Rig, body: ConeBody, seen: Float, p_near: Float) -> Float:
+    """Return poses (B, D) that landmarks (V, L, 3) of a frame show, the likeliest first.
+
+    The landmarks' cost has several minima, such as a person who faces either way. It is minimised from figures at a
+    point (3,), by Gauss-Newton, at first with wide distributions.
+    """
+    skeleton = body.skeleton
+    start = figures(skeleton, p_near)
+    prior = Quadratic.about(start, np.where(skeleton.prismatic, 1.0, OPEN_ANGLE) ** -2.0)
+    poses = start
+    for widened in WIDENED:
+        cost = LandmarkCue(rig, body, seen, widened).normal(poses) + prior
+        step = np.linalg.solve(cost.matrix, cost.linear[..., None])[..., 0] - poses
+        poses = skeleton.clip(poses + np.clip(step, -LONGEST_STEP, LONGEST_STEP))
+    return np.asarray(poses[np.argsort(LandmarkCue(rig, body, seen).score(poses), kind="stable")])
 
 
 def of_person(landmarks: Float | None, masks: NDArray[np.uint8]) -> Float | None:

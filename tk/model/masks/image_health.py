@@ -44,7 +44,7 @@ _FOLLOWS = 0.87
 Sampled = tuple[NDArray[np.int16], NDArray[np.bool_]]
 """Images (C, h, w, 3) and masks (C, h, w) of a frame, every some pixels."""
 
-BLANK, FROZEN, MOVED = "shows nothing", "stands still", "has been moved since the first frame"
+BLANK, FROZEN, MOVED = "blank", "frozen", "moved"  #: faults; MOVED: since the first frame
 
 
 @dataclass(frozen=True)
@@ -71,6 +71,10 @@ class ImageHealth(Stateful[HealthState]):
 
     The still parts of the image of a camera that stands firm stay where they are, see
     :class:`~tk.model.masks.image_shift.ImageShift`.
+
+    Attributes:
+        moved: (C,) by which share of its longer side each image has moved since the first frame; NaN if it is unknown.
+            None before the first frame.
     """
 
     State = HealthState
@@ -79,6 +83,7 @@ class ImageHealth(Stateful[HealthState]):
         self._references: NDArray[np.uint8] | None = None
         self._masks: NDArray[np.bool_] | None = None
         self._shift = ImageShift()
+        self.moved: NDArray[np.float64] | None = None
 
     def look(
         self, images: NDArray[np.uint8], masks: NDArray[np.uint8], doubtful: NDArray[np.bool_] | None = None
@@ -97,10 +102,12 @@ class ImageHealth(Stateful[HealthState]):
         # the green channel suffices
         shown = images[:, step // 2 :: step, step // 2 :: step, 1].copy() if given else small * np.uint8(255)
         found: list[str | None] = [None] * C
+        self.moved = np.full(C, np.nan)
         if given:
+            self.moved = self._shift.look(images, masks, doubtful)
             for c in np.flatnonzero(shown.reshape(C, -1).std(axis=1) < _BLANK_LEVELS).tolist():
                 found[c] = BLANK
-            for c in np.flatnonzero(self._shift.look(images, masks, doubtful) > MOST_SHIFT).tolist():
+            for c in np.flatnonzero(self.moved > MOST_SHIFT).tolist():
                 found[c] = found[c] or MOVED
         if self._references is None or self._masks is None or self._references.shape != shown.shape:
             self._references, self._masks = shown, np.repeat(small[None], C, axis=0)
