@@ -23,7 +23,6 @@ import numpy as np
 from scripts.ablation import Recorded
 from tk.model.body.limb_candidates import Limb
 from tk.model.setup import Subject
-from tk.trackers.proposals import exchanged, limbs
 from tk.trackers.protocol import Frame
 from tk.trackers.region import RegionTracker
 
@@ -72,8 +71,7 @@ class Trials(RegionTracker):
                     continue
                 misplaced = self.misplaced(evidence, met.label[0])
                 started = time.perf_counter()
-                proposed = limbs.propose(self, seen, wrong[0], misplaced), exchanged.propose(self, seen, wrong[0])
-                best = self.best(seen, wrong[0], *proposed)
+                best = self.best(seen, wrong[0], *self.proposed(seen, wrong[0], misplaced))
                 seconds = time.perf_counter() - started
                 yield Trial(limb in misplaced, bool(self._off(limb, best[None], pose)[0] < BACK_M), seconds)
 

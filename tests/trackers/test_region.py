@@ -149,7 +149,7 @@ def test_seed_draws_the_candidates_of_the_limb_search(monkeypatch: pytest.Monkey
         tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=1 / 15))
         tracker.seed = seed
         drawn.clear()  # `tracker_at` searches with the default
-        limbs.propose(tracker, tracker.see(observe(MASKS[0], 1)), tracker.last_poses()[0], tracker.limbs)
+        limbs.modes(tracker, tracker.see(observe(MASKS[0], 1)), tracker.last_poses()[0], tracker.limbs)
         every.append(tuple(drawn))
     assert every[0] == every[1] and not set(every[0]) & set(every[2])
     setup = Setup(RIG, Volume((0.0, 0.0, 1.0), (2.0, 2.0, 2.0)), "z", 15.0, (Subject(STATURE),))

@@ -162,7 +162,7 @@ class ContourFinder:
     # --- initialisation (silhouette paper, section 4.6) ---------------------------------------------------------
 
     def find(self, frames: Sequence[Frame], subject: Subject) -> Float:
-        """Return the pose (D,) in the first of the frames; the body is fitted to all of them.
+        """Return poses (B, D) in the first of the frames, the likeliest first; the body is fitted to all of them.
 
         Args:
             frames: consecutive observations, at least one; a whole stride is better.
@@ -199,7 +199,7 @@ class ContourFinder:
             seen = [self.see(blind(f), pyramid=shown) for f, shown in zip(some, silhouettes, strict=True)]
             hypotheses = find_person(self, seen, rough)
         if not self.contours.adapt or subject.body is not None:
-            return np.asarray(hypotheses[0].poses[0])
+            return np.array([one.poses[0] for one in hypotheses])
         return self._adapt(frames, pyramids, hypotheses, average.stature, stature is not None)
 
     @contextmanager
@@ -234,7 +234,7 @@ class ContourFinder:
         stature: float,
         known: bool,
     ) -> Float:
-        """Fit the body to the opening and return the pose (D,) in its first frame.
+        """Fit the body to the opening and return the poses (B, D) in its first frame, the likeliest first.
 
         Of several hypotheses the one is chosen that has the lowest sum of two costs: that with the average body and
         that with the body fitted to it, because a fitted body compensates a part of a wrong trajectory.
@@ -256,9 +256,9 @@ class ContourFinder:
                 costs = np.array(list(map(self._converged_score, frames, pyramids, hypothesis.poses)))
                 cost += float(costs[np.isfinite(costs)].mean())  # infinite in frames without a person
             found.append((cost, body, fitted[0]))
-        _, body, pose = min(found, key=lambda one: one[0])
-        self.take_body(body)
-        return np.asarray(pose)
+        found.sort(key=lambda one: one[0])
+        self.take_body(found[0][1])
+        return np.array([pose for _, _, pose in found])
 
     def _converged_score(self, frame: Frame, pyramid: Pyramid, pose: Float) -> float:
         """Return the cost of the pose that a pose (D,) converges to, nats; uncertain pixels count half."""
@@ -388,9 +388,14 @@ class ContourFinder:
         poses, cost = self.compared(seen, pose, *proposed)
         return np.asarray(poses[int(np.argmin(cost))])
 
+    def proposed(self, seen: Seen, pose: Float, misplaced: Sequence[Limb] = ()) -> tuple[Float, Float]:
+        """Return what a search for the limbs proposes beside a pose (D,), poses (B, D) and (2, D)."""
+        found = limbs.modes(self, seen, pose, misplaced)
+        return limbs.propose(self, seen, pose, found), exchanged.propose(self, seen, pose)
+
     def improved(self, seen: Seen, pose: Float) -> Float:
         """Return the most probable (D,) of a pose and what a search for its limbs proposes."""
-        return self.best(seen, pose, limbs.propose(self, seen, pose), exchanged.propose(self, seen, pose))
+        return self.best(seen, pose, *self.proposed(seen, pose))
 
     def model(self) -> Mapping[str, Any]:
         """Return the body as stored in `/model`."""

@@ -119,6 +119,7 @@ class RegionState:
         mean_posture, postures: (J, 3) mean directions, of this number of frames.
         lost_for, high_for: consecutive frames in which the person was lost, and with a high residual.
         view_m: see :class:`RegionTracker`.
+        spread: (J,) variance of the joints' positions along an axis, metres², over the modes of the last limb search.
         fresh: whether no frame has been tracked yet.
     """
 
@@ -130,6 +131,7 @@ class RegionState:
     lost_for: int
     high_for: int
     view_m: float
+    spread: Float
     fresh: bool
 
 
@@ -167,6 +169,7 @@ class RegionTracker(ContourTracker[RegionState]):
         self._alive: list[Hypothesis] = []
         self._mean_posture: Float = np.zeros((len(JOINTS), 3))
         self._postures = 0
+        self._spread: Float = np.zeros(len(JOINTS))
         self._fresh = True
         self.view_m = VIEW_M
         self._reset()
@@ -177,8 +180,7 @@ class RegionTracker(ContourTracker[RegionState]):
         self._lost_for = self._high_for = 0
 
     def start(self, frames: Sequence[Frame], subject: Subject) -> None:
-        pose = self.find(frames, subject)
-        self._alive = [Hypothesis(pose, pose, 0.0)]
+        self._alive = [Hypothesis(pose, pose, 0.0) for pose in self.find(frames, subject)]
         self._mean_posture, self._postures = np.zeros((len(JOINTS), 3)), 0
         self._fresh = True
         self._reset()
@@ -267,10 +269,13 @@ class RegionTracker(ContourTracker[RegionState]):
         best = self._best.pose
         proposed = [of_landmarks.propose(self, seen, best)]
         if searched:
-            proposed += [limbs.propose(self, seen, best, misplaced), exchanged.propose(self, seen, best)]
+            found = limbs.modes(self, seen, best, self.limbs if self._fresh else misplaced)
+            proposed += [limbs.propose(self, seen, best, found), exchanged.propose(self, seen, best)]
             proposed.append(of_heading.propose(self, seen, best))
         if self._choose(seen, *proposed):
             look = self._look(seen)
+        if searched:
+            self._spread = limbs.spread(self.body.skeleton, self._best.pose, found)
         watch.lap("search")
         lost = float(np.nanmean(look.error)) > contours.lost_error
         lost |= self._lost_for < UNKNOWN_AFTER and self.residuals.jumped(look.residual)
@@ -444,13 +449,13 @@ class RegionTracker(ContourTracker[RegionState]):
 
     def _sigma(self, pose: Float, look: _Look, landmarks: Float | None) -> Float:
         """Return (J,) one standard deviation of each joint's position along an axis, metres: from the evidence of this
-        frame, the difference to the mean posture until now, what its landmarks contradict, and the spread of the
-        hypotheses."""
+        frame, the difference to the mean posture until now, what its landmarks contradict, the modes of the limbs, and
+        the spread of the hypotheses."""
         skeleton = self.body.skeleton
         variance = self.variance(pose, look.curvature, self.prior(pose), look.label, look.residual)
         self._postures = min(self._postures + 1, _POSTURE_FRAMES)
         self._mean_posture += (directions(skeleton, pose) - self._mean_posture) / self._postures
-        variance += posture_variance(skeleton, pose, self._mean_posture)
+        variance += posture_variance(skeleton, pose, self._mean_posture) + self._spread
         if landmarks is not None:
             variance += contradiction(self.views.rig, self.body, pose, landmarks)
         if len(self._alive) > 1:

@@ -41,7 +41,6 @@ from tk.optim import schedule
 from tk.optim.smd import MAX_ITERATIONS
 from tk.settings import Settings
 from tk.trackers.contour_finder import ContourFinder
-from tk.trackers.proposals import exchanged, limbs
 from tk.trackers.protocol import Estimate, Frame, Stopwatch
 
 Float = NDArray[np.float64]
@@ -139,7 +138,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
         """
         # without images: colours inside the silhouettes are a cue of the region tracker only
         blind = [Frame(f.index, f.images[:0], f.masks) for f in frames]
-        pose = self._finder.find(blind, subject)
+        pose = self._finder.find(blind, subject)[0]
         first = frames[0]
         self.hull.update(first.masks)
         surface = self.hull.surface(first.images)
@@ -227,8 +226,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
         # without images: colours inside the silhouettes are a cue of the region tracker only
         seen = finder.see(Frame(frame.index, frame.images[:0], frame.masks, frame.uncertain))
         converged = finder.settle(seen.pyramid, self._to_contours(found.pose)[None]).states[0]
-        proposed = limbs.propose(finder, seen, converged), exchanged.propose(finder, seen, converged)
-        candidates, _ = finder.compared(seen, converged, *proposed)
+        candidates, _ = finder.compared(seen, converged, *finder.proposed(seen, converged))
         starts = problem.constrain(np.array([self._from_contours(candidate) for candidate in candidates]))
         values = problem.values(starts)
         best, here = int(np.argmin(values)), problem.value(found.pose)
