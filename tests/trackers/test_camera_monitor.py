@@ -155,7 +155,7 @@ def test_landmarks_confirm_a_camera_whose_masks_contradict_the_others(scene: Sce
         if seen == "alone":
             landmarks[:, 0] = np.nan
         frames.append(replace(frame, landmarks=None if seen == "none" else landmarks))
-    assert (1 in opening_agreement(scene.setup, frames).wrong) == wrong
+    assert (1 in opening_agreement(scene.setup, frames, np.zeros((3, 4), np.bool_)).wrong) == wrong
 
 
 def test_two_cameras_that_face_each_other_contradict_no_third(scene: Scene) -> None:
@@ -292,6 +292,19 @@ def test_inconsistent_camera_is_excluded_from_the_opening(scene: Scene) -> None:
     (line,) = monitor.report()
     assert "camera cam3 disagrees" in line and f"frames 0 to {FRAMES - 1}" in line
     assert isinstance(monitor.tracker, RegionTracker) and monitor.tracker.view_m == VIEW_M
+
+
+def test_camera_that_is_black_in_a_part_of_the_opening_stays_in_the_other_part(scene: Scene) -> None:
+    monitor, opening = scene.monitor(), []
+    for frame in scene.frames[:5]:
+        images, masks = frame.images.copy(), frame.masks.copy()
+        if frame.index > 1:
+            images[2] = masks[2] = 0
+        opening.append(replace(frame, images=images, masks=masks))
+    shown = monitor.start(opening)
+    assert [bool(f.masks[2].any()) for f in shown] == [True, True, False, False, False]
+    assert all(f.masks[[0, 1, 3]].any(axis=(1, 2)).all() for f in shown)
+    assert monitor.step(opening[0])[1].masks[2].any() and monitor.report() == []
 
 
 def test_sigma_counts_what_the_test_of_the_opening_tolerates(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from tk.kernels.mask_values import PERSON
 from tk.model.cameras.camera import Rig
 from tk.model.people import LocatedPerson, PeopleFinder
 from tk.model.setup import Setup
-from tk.trackers.camera_monitor import opening_agreement
+from tk.trackers.camera_monitor import image_faults, opening_agreement
 from tk.trackers.protocol import Frame, without_cameras
 
 # A camera shows a person if its mask covers this share of the person's hull from the other cameras. Right cameras of
@@ -29,7 +29,7 @@ def really_there(
     """
     if len(found) == 1 and finder.explain(opening[0].masks, found):
         return found
-    agreement = opening_agreement(setup, opening)
+    agreement = opening_agreement(setup, opening, image_faults(opening))
     if agreement.refusal or not agreement.wrong:
         return found
     wrong = np.isin(np.arange(len(setup.rig)), agreement.wrong)

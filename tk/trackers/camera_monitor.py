@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -51,6 +52,7 @@ from tk.trackers.protocol import Estimate, Frame, Tracker, sharing, shows_person
 from tk.trackers.region import RegionTracker
 
 Float = NDArray[np.float64]
+T = TypeVar("T")
 
 # Frames of the opening that are compared.
 _OPENING = 5
@@ -61,19 +63,30 @@ Span = tuple[int, int, int]
 """Frames: the first, the last, and their number."""
 
 
-def spread_over(frames: Sequence[Frame], count: int = _OPENING) -> list[Frame]:
+def spread_over(frames: Sequence[T], count: int = _OPENING) -> list[T]:
     """Return this many of the opening's frames, spread over it."""
     return [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))]
 
 
-def opening_agreement(setup: Setup, frames: Sequence[Frame]) -> Agreement:
+def image_faults(frames: Sequence[Frame]) -> NDArray[np.bool_]:
+    """Return (F, C) whether each image of consecutive frames has a fault."""
+    health = ImageHealth()
+    return np.array([[fault is not None for fault in health.look(f.images, f.masks)] for f in frames], np.bool_)
+
+
+def opening_agreement(setup: Setup, frames: Sequence[Frame], bad: NDArray[np.bool_]) -> Agreement:
     """Return whether the silhouettes of the opening frames agree.
 
     A network's masks have holes and contain pieces of other things. A camera whose masks contradict the others is right
-    if its landmarks agree with the others'.
+    if its landmarks agree with the others'. ``bad``: (F, C) images that are not compared.
     """
-    found = MaskAgreement(setup.rig, setup.volume).compare([frame.masks for frame in spread_over(frames)])
-    seen = [frame.landmarks for frame in frames if frame.landmarks is not None]
+    rows = spread_over(range(len(frames)))
+    found = MaskAgreement(setup.rig, setup.volume).compare([frames[i].masks for i in rows], ~bad[rows])
+    seen = [
+        np.where(wrong[:, None, None], np.nan, frame.landmarks)
+        for frame, wrong in zip(frames, bad, strict=True)
+        if frame.landmarks is not None
+    ]
     if not seen or not (found.wrong or found.refusal):
         return found
     return found.confirmed(evidence_for_cameras(setup.rig, seen))
@@ -148,13 +161,11 @@ class CameraMonitor(Stateful[MonitorState]):
             CaptureError: the cameras contradict each other, or the person's size contradicts the height in
                 `capture.toml`.
         """
-        health = ImageHealth()
-        found = [[fault is not None for fault in health.look(f.images, f.masks)] for f in frames]
-        bad = np.array(found) & self.tracker.can_exclude_cameras  # trackers of hulls need all cameras
-        shown = [without_cameras(f, b) for f, b in zip(frames, bad, strict=True)]
-        agreement = opening_agreement(self._setup, shown)
+        excludes = self.tracker.can_exclude_cameras  # trackers of hulls need all cameras
+        bad = image_faults(frames) & excludes
+        agreement = opening_agreement(self._setup, frames, bad)
         if whole and (agreement.refusal or np.count_nonzero(agreement.tested_right) < 2):
-            agreement = opening_agreement(self._setup, [without_cameras(f, np.asarray(bad.all(axis=0))) for f in whole])
+            agreement = opening_agreement(self._setup, whole, image_faults(whole) & excludes)
         if agreement.refusal:
             raise CaptureError(agreement.refusal)
         if self._region is not None:
@@ -171,7 +182,7 @@ class CameraMonitor(Stateful[MonitorState]):
         alone = not any((f.masks == OTHERS).any() for f in frames)  # the hull of two people is larger than one
         if self._subject.height_m is not None and alone:
             check_extent(agreement.extent_m, self._subject.height_m)
-        return [without_cameras(f, out) for f in shown]
+        return [without_cameras(f, out | b) for f, b in zip(frames, bad, strict=True)]
 
     def check_body(self) -> None:
         """Refuse a body of an impossible size, after the tracker's start.

@@ -68,6 +68,18 @@ def part(masks: np.ndarray, cameras: list[int], rig: Rig = RIG) -> Agreement:
     return compare(masks[:, cameras], Rig(tuple(rig[c] for c in cameras)))
 
 
+@pytest.mark.parametrize("shown", [0, 255])
+def test_masks_that_do_not_exist_are_no_evidence(masks: np.ndarray, shown: int) -> None:
+    spoilt, there = masks.copy(), np.ones(masks.shape[:2], np.bool_)
+    spoilt[1:, 2], there[1:, 2] = shown, False
+    assert compare(spoilt).wrong or compare(spoilt).refusal
+    found = MaskAgreement(RIG, VOLUME).compare(list(spoilt), there)
+    assert found.wrong == () and found.refusal == "" and found.closes.all() and found.disagreement < 0.01
+    there[:, [0, 1, 3, 4]] = False  # one camera in one frame: nothing is left to compare
+    alone = MaskAgreement(RIG, VOLUME).compare(list(spoilt), there)
+    assert alone.wrong == () and alone.refusal == "" and np.isnan(alone.disagreement)
+
+
 def test_exact_masks_agree(masks: np.ndarray) -> None:
     found = compare(masks)
     assert found.wrong == () and found.refusal == "" and found.closes.all()

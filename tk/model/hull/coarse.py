@@ -7,7 +7,7 @@ is therefore computed from one table of voxels by cameras.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -78,6 +78,10 @@ class Voxels:
     def inside(self, masks: NDArray) -> Bool:
         """Return (C, N) whether a voxel's centre is in the camera's mask, of (C, h, w), or outside its image."""
         return ~self.sees | np.stack([mask.ravel()[p] > 0 for mask, p in zip(masks, self.pixels, strict=True)])
+
+    def by(self, cameras: Bool) -> Voxels:
+        """Return the same voxels as some cameras (C,) see them; the others see none, and carve none."""
+        return self if cameras.all() else replace(self, sees=self.sees & cameras[:, None])
 
     def xy(self, camera: int, chosen: Bool) -> NDArray[np.int64]:
         """Return (M, 2) pixels of the chosen voxels (N,) that a camera sees."""

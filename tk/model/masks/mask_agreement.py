@@ -163,9 +163,17 @@ class MaskAgreement:
         """Return (C, h, w) the same, with the pixels where others may hide the person."""
         return self.small(masks) | self.small(np.uint8(255) * (masks == OTHERS))
 
-    def compare(self, frames: Sequence[Masks]) -> Agreement:
-        """Return the agreement over frames of masks (C, H, W)."""
+    def compare(self, frames: Sequence[Masks], there: Bool | None = None) -> Agreement:
+        """Return the agreement over F frames of masks (C, H, W).
+
+        Args:
+            frames: the masks. An empty one says that its camera sees nobody.
+            there: (F, C) masks that say anything; the others are not compared. None: all.
+        """
         C = len(self.rig)
+        if there is None:
+            there = np.ones((len(frames), C), np.bool_)
+        frames = [masks if here.all() else masks * here[:, None, None] for masks, here in zip(frames, there, strict=True)]
         outlines = [[_outline(camera, masks[c]) for c, camera in enumerate(self.rig)] for masks in frames]
         pairs = tangency(outlines, self.rig.centers)
         error = excess(pairs)
@@ -174,7 +182,7 @@ class MaskAgreement:
         # a silhouette that extends beyond no other is no contradiction: the mask misses a part, or others have a shadow
         wrong = [c for c in tested if c not in kept and extends(pairs, c)] if kept else []
         seen = [self.small(masks) for masks in frames]
-        hulls = self.hulls([self.possible(masks) for masks in frames])
+        hulls = self.hulls([self.possible(masks) for masks in frames], there)
         views = [(masks, hull) for masks, hull in zip(seen, hulls, strict=True) if hull is not None]
         right = [c for c in range(C) if c not in wrong]
         refused = not kept and bool(tested)
@@ -185,8 +193,8 @@ class MaskAgreement:
                 break
             wrong.append(odd)
             right.remove(odd)
-        suspects = wrong if not refused else tested if C <= _SWAPS_OF else []
-        swapped = self._swapped(frames, outlines, suspects)
+        accused = wrong if not refused else tested if C <= _SWAPS_OF else []
+        swapped = self._swapped(frames, outlines, accused)
         if swapped or refused:
             wrong, right = [], list(range(C))
         if swapped:  # the other cameras may suffice, but the remedy is known
@@ -200,7 +208,7 @@ class MaskAgreement:
         for c in range(C):
             others = [k for k in right if k != c]
             if others:
-                shown = [(masks[c], hull.silhouette(hull.carve(others), c)) for masks, hull in views]
+                shown = _silhouettes(views, c, others)
                 outside[c] = _share_outside(shown)
                 shift[c] = self.rig[c].reduction * self._least_shift(shown)
         extents = [extent for _, hull in views if (extent := hull.extent(right)) > 0]
@@ -217,11 +225,11 @@ class MaskAgreement:
         )
 
     def _swapped(
-        self, frames: Sequence[Masks], outlines: Sequence[Sequence[Outline | None]], suspects: Sequence[int]
+        self, frames: Sequence[Masks], outlines: Sequence[Sequence[Outline | None]], accused: Sequence[int]
     ) -> tuple[int, int] | None:
-        """Return the two suspects whose exchanged videos make all cameras consistent; None if no two do."""
+        """Return the two accused cameras whose exchanged videos make all cameras consistent; None if no two do."""
         found: list[tuple[float, tuple[int, int]]] = []
-        for a, b in combinations(sorted(suspects), 2):
+        for a, b in combinations(sorted(accused), 2):
             if (self.rig[a].width, self.rig[a].height) != (self.rig[b].width, self.rig[b].height):
                 continue
             exchanged = []
@@ -274,16 +282,22 @@ class MaskAgreement:
         views = [(self.small(masks), hull) for masks, hull in zip(frames, hulls, strict=True) if hull is not None]
         return self._mean_outside(views, cameras)
 
-    def hulls(self, seen: Sequence[Bool]) -> list[Hull | None]:
-        """Return each frame's hulls from its small masks (C, h, w); None if no two cameras see the same voxel."""
+    def hulls(self, seen: Sequence[Bool], there: Bool | None = None) -> list[Hull | None]:
+        """Return each frame's hulls from its small masks (C, h, w); None if no two cameras see the same voxel.
+
+        ``there``: (F, C) masks that carve; None: all.
+        """
+        if there is None:
+            there = np.ones((len(seen), len(self.rig)), np.bool_)
         grid = VoxelGrid.cover(self.volume, _COARSE)
         coarse = Voxels.of(self.rig, grid.centers(), grid.voxel_m, self.step)
         near = np.zeros(grid.count, bool)
         found = []
-        for masks in seen:
+        for masks, here in zip(seen, there, strict=True):
             # grown masks: a voxel counts if any part of it may be inside
             grown = np.stack([dilated(m, int(r)) for m, r in zip(masks, coarse.reach, strict=True)])
-            chosen = coarse.near(coarse.inside(grown), 2)
+            voxels = coarse.by(here)
+            chosen = voxels.near(voxels.inside(grown), 2)
             found.append(len(chosen) > 0)
             near[chosen] = True
         # each of these voxels is divided into eight
@@ -291,10 +305,11 @@ class MaskAgreement:
         centers = (corners + grid.centers(np.flatnonzero(near))).reshape(-1, 3)
         fine = Voxels.of(self.rig, centers, grid.voxel_m / 2, self.step)
         result: list[Hull | None] = []
-        for some, masks in zip(found, seen, strict=True):
-            inside = fine.inside(masks)
-            chosen = fine.near(inside, 2)
-            result.append(fine.hull(inside, chosen) if some and len(chosen) else None)
+        for some, masks, here in zip(found, seen, there, strict=True):
+            voxels = fine.by(here)
+            inside = voxels.inside(masks)
+            chosen = voxels.near(inside, 2)
+            result.append(voxels.hull(inside, chosen) if some and len(chosen) else None)
         return result
 
     def _odd(self, views: Sequence[tuple[Bool, Hull]], cameras: Sequence[int], total: float) -> int | None:
@@ -317,9 +332,7 @@ class MaskAgreement:
         for c in cameras:
             others = [k for k in cameras if k != c]
             if others:
-                shares.append(
-                    _share_outside([(masks[c], hull.silhouette(hull.carve(others), c)) for masks, hull in views])
-                )
+                shares.append(_share_outside(_silhouettes(views, c, others)))
         known = np.isfinite(shares)
         return float(np.array(shares)[known].mean()) if known.any() else float("nan")
 
@@ -353,6 +366,18 @@ def _outline(camera: Camera, mask: Masks) -> Outline | None:
     if others.any() and (dilated(others, 1) & (mask >= PERSON)).any():
         return None
     return Outline.of(camera, mask)
+
+
+def _silhouettes(
+    views: Sequence[tuple[Bool, Hull]], camera: int, others: Sequence[int]
+) -> list[tuple[Bool, Bool]]:
+    """Return a camera's mask, and the silhouette of the hull of some others, of each frame in which one of them sees
+    anything."""
+    return [
+        (masks[camera], hull.silhouette(hull.carve(others), camera))
+        for masks, hull in views
+        if hull.voxels.sees[list(others)].any()
+    ]
 
 
 def _share_outside(pairs: Sequence[tuple[Bool, Bool]]) -> float:
