@@ -176,7 +176,8 @@ class CameraMonitor(Stateful[MonitorState]):
         out = self._cameras.states > 0
         if out.any() and not self.tracker.can_exclude_cameras:
             reasons = (
-                f"camera {self._names[c]} {FAULTS[WRONG]} ({reason})" for c, reason in self._opening_reasons.items()
+                f"camera {self._names[c]} {FAULTS[WRONG].text} ({reason})"
+                for c, reason in self._opening_reasons.items()
             )
             raise CaptureError(f"{'; '.join(reasons)}: this method needs masks that fit from all cameras")
         alone = not any((f.masks == OTHERS).any() for f in frames)  # the hull of two people is larger than one
@@ -230,12 +231,12 @@ class CameraMonitor(Stateful[MonitorState]):
         residual, left_out = estimate.residual, (cameras.states > 0) & ~cameras.unfit
         kept = (cameras.states == 0) & np.isfinite(residual[:, 0])
         touched = touched_by_others(tracker.screen.sample(frame.masks))
-        suspect = self._suspect(tracker, residual, kept, touched)
-        if left_out.any() or suspect is not None:
+        accused = self._accused(tracker, residual, kept, touched)
+        if left_out.any() or accused is not None:
             residual = self._residual(tracker, frame, estimate)
-            suspect = self._suspect(tracker, residual, kept, touched)
-        if suspect is not None:
-            others = kept & (np.arange(len(kept)) != suspect)
+            accused = self._accused(tracker, residual, kept, touched)
+        if accused is not None:
+            others = kept & (np.arange(len(kept)) != accused)
             if determine_depth(self._setup.rig.centers, estimate.joints.mean(axis=0), others):
                 after, fewer = tracker.state, without_cameras(used, ~others)
                 tracker.state = before
@@ -243,7 +244,7 @@ class CameraMonitor(Stateful[MonitorState]):
                 again = self._residual(tracker, frame, second)
                 # both poses by a baseline that has not learned this frame from the camera
                 with_it, without = (_likelihoods(tracker, found, touched) for found in (residual, again))
-                if cameras.judge(suspect, others, with_it, without):
+                if cameras.judge(accused, others, with_it, without):
                     estimate, used = replace(second, status=estimate.status), fewer
                     kept, residual = others, again
                 else:
@@ -252,14 +253,14 @@ class CameraMonitor(Stateful[MonitorState]):
         self._excess = tracker.residuals.mean_excess(np.where(kept, residual.sum(axis=1), np.nan))
         return estimate, used
 
-    def _suspect(
+    def _accused(
         self, tracker: RegionTracker, residual: Float, kept: NDArray[np.bool_], touched: NDArray[np.bool_]
     ) -> int | None:
         """Return the camera that is to be judged, by a residual (C, 2); None if none is."""
         if np.count_nonzero(kept) < 3:
             return None
         best = likelihoods(np.zeros_like(residual), tracker.residuals.spread)
-        return self._cameras.suspect(_likelihoods(tracker, residual, touched), best, kept)
+        return self._cameras.accused(_likelihoods(tracker, residual, touched), best, kept)
 
     def _residual(self, tracker: RegionTracker, frame: Frame, estimate: Estimate) -> Float:
         """Return (C, 2) missing and surplus area at the estimate's pose, of excluded cameras, too. Missing area on
@@ -343,7 +344,9 @@ class CameraMonitor(Stateful[MonitorState]):
             camera, _, state = key.partition("/")
             because = self._opening_reasons.get(int(camera)) if state == WRONG else None
             more = f" ({because})" if because else ""
-            lines.append(f"camera {self._names[int(camera)]} {FAULTS[state]}{more}: left out of {described(*span)}")
+            lines.append(
+                f"camera {self._names[int(camera)]} {FAULTS[state].text}{more}: left out of {described(*span)}"
+            )
         return lines
 
 

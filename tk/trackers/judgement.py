@@ -23,6 +23,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from statistics import NormalDist
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,7 @@ from numpy.typing import NDArray
 from tk.io.results.status import Status
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import determine_depth
-from tk.model.masks.image_health import BLANK, FROZEN, MOVED, described
+from tk.model.masks.image_health import IMAGE_FAULTS, described
 from tk.model.stateful import Stateful
 from tk.trackers.residual import LEVEL, LEVEL_SPREAD, OUTLIER, RATE, RECENT, displacement
 
@@ -43,18 +44,24 @@ _TINY = 1e-3
 UNKNOWN_AFTER = 6
 
 
+class Fault(NamedTuple):
+    """A fault of a camera: the text for the user, and whether it is certain, because the image itself shows it."""
+
+    text: str
+    certain: bool
+
+
 WRONG, TORN = "wrong", "torn"
-#: faults of a camera, as messages name them; a further kind of evidence has its line here
+#: faults of a camera by the names of its states
 FAULTS = {
-    WRONG: "disagrees with the others",
-    TORN: "misses a part of the person",
-    BLANK: "shows nothing",
-    FROZEN: "stands still",
-    MOVED: "has been moved since the first frame",
+    WRONG: Fault("disagrees with the others", False),
+    TORN: Fault("misses a part of the person", False),
+    **{name: Fault(text, True) for name, (text, _) in IMAGE_FAULTS.items()},
 }
 STATES = ("used", *FAULTS)
+_CERTAIN = np.array([False, *(fault.certain for fault in FAULTS.values())])
 #: meaning of each value of `/evidence/camera`
-STATE_MEANINGS = tuple(f"{value}: {FAULTS.get(state, state)}" for value, state in enumerate(STATES))
+STATE_MEANINGS = ("0: used", *(f"{value}: {fault.text}" for value, fault in enumerate(FAULTS.values(), 1)))
 
 # Faults of a camera a second: each kind begins once in eleven minutes, and lasts five seconds.
 _BEGIN_HZ, _END_HZ = 0.0015, 0.2
@@ -115,7 +122,7 @@ class Cameras(Stateful[Belief]):
     @property
     def unfit(self) -> Bool:
         """(C,) cameras whose image shows that they cannot be used."""
-        return self.states > STATES.index(TORN)
+        return np.asarray(_CERTAIN[self.states])
 
     def be(self, camera: int, state: str) -> None:
         """Take a camera's state for certain."""
@@ -136,7 +143,7 @@ class Cameras(Stateful[Belief]):
             before = right * begin + np.array([(wrong + torn) * end, wrong * (1 - end), torn * (1 - end)])
             self._probability[camera, :3] = _normalised(np.log(before) + likelihood[camera])
 
-    def suspect(self, likelihood: Float, best: Float, kept: Bool) -> int | None:
+    def accused(self, likelihood: Float, best: Float, kept: Bool) -> int | None:
         """Return which of the cameras used, ``kept`` (C,), is to be judged; None if none is.
 
         Its residual must speak against it; and with what the others can gain without it at most, a fault must be

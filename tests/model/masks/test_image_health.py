@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from tk.model.masks.image_health import BLANK, FROZEN, MOVED, ImageHealth, contradiction, described, sampled
+from tk.model.masks.image_health import MOVED, ImageHealth, contradiction, described, sampled
 
 C, H, W = 4, 96, 128
 
@@ -65,7 +65,7 @@ def test_frozen_camera_is_found_once_the_others_have_moved_until_it_moves_again(
         held = images[1].copy(), masks[1].copy()
         told.append(health.look(images, masks))
     assert all(reasons[c] is None for reasons in told for c in (0, 2, 3))
-    frozen = [t for t in range(14) if told[t][1] == FROZEN]
+    frozen = [t for t in range(14) if told[t][1] == "frozen"]
     # a frame's movement is a sixth of the bar: more than the threshold from the first or second frame on
     assert frozen in (list(range(4, 10)), list(range(5, 10)))
 
@@ -92,7 +92,7 @@ def test_unchanged_images_are_healthy_while_nobody_moves() -> None:
     assert all(health.look(images, masks) == [None] * C for _ in range(5))
 
 
-@pytest.mark.parametrize(("frozen", "told"), [((0, 1), [FROZEN, FROZEN, None, None]), ((0, 1, 3), [None] * C)])
+@pytest.mark.parametrize(("frozen", "told"), [((0, 1), ["frozen", "frozen", None, None]), ((0, 1, 3), [None] * C)])
 def test_several_frozen_cameras_are_found_if_half_of_the_others_move(frozen: tuple[int, ...], told: list) -> None:
     rng, health = np.random.default_rng(0), ImageHealth()
     first = frame(0, rng)
@@ -108,7 +108,7 @@ def test_several_frozen_cameras_are_found_if_half_of_the_others_move(frozen: tup
 def test_uniform_image_is_blank(level: int) -> None:
     images, masks = frame(0, np.random.default_rng(0))
     images[2] = level
-    assert ImageHealth().look(images, masks) == [None, None, BLANK, None]
+    assert ImageHealth().look(images, masks) == [None, None, "blank", None]
 
 
 def test_masks_are_compared_if_there_are_no_images() -> None:
@@ -119,7 +119,7 @@ def test_masks_are_compared_if_there_are_no_images() -> None:
         masks = frame(t, rng)[1]
         masks[3] = first[3]
         told.append(health.look(np.empty((C, 0, 0, 3), np.uint8), masks))
-    assert told[0] == [None] * C and told[-1] == [None, None, None, FROZEN]
+    assert told[0] == [None] * C and told[-1] == [None, None, None, "frozen"]
 
 
 def test_state_is_restored() -> None:
@@ -132,7 +132,7 @@ def test_state_is_restored() -> None:
     again = ImageHealth()
     again.state = health.state
     told = [again.look(*f) for f in frames[3:]]
-    assert told == [health.look(*f) for f in frames[3:]] and told[-1][0] == FROZEN
+    assert told == [health.look(*f) for f in frames[3:]] and told[-1][0] == "frozen"
     again.state = ImageHealth().state
     assert again.look(*frames[-1]) == [None] * C
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -44,7 +45,7 @@ _FOLLOWS = 0.87
 Sampled = tuple[NDArray[np.int16], NDArray[np.bool_]]
 """Images (C, h, w, 3) and masks (C, h, w) of a frame, every some pixels."""
 
-BLANK, FROZEN, MOVED = "blank", "frozen", "moved"  #: faults; MOVED: since the first frame
+MOVED = "moved"  #: the fault of a camera that has been moved since the first frame
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,14 @@ class HealthState:
     references: NDArray[np.uint8] | None
     masks: NDArray[np.bool_] | None
     shift: ShiftState
+
+
+class _Look(NamedTuple):
+    """What is seen of a frame, every some pixels: (C, h, w) the images, and the masks; whether images are given."""
+
+    shown: NDArray[np.uint8]
+    small: NDArray[np.bool_]
+    given: bool
 
 
 class ImageHealth(Stateful[HealthState]):
@@ -88,7 +97,7 @@ class ImageHealth(Stateful[HealthState]):
     def look(
         self, images: NDArray[np.uint8], masks: NDArray[np.uint8], doubtful: NDArray[np.bool_] | None = None
     ) -> list[str | None]:
-        """Return for each camera :data:`BLANK`, :data:`FROZEN`, :data:`MOVED` or, if nothing is wrong, None.
+        """Return for each camera its fault, one of :data:`IMAGE_FAULTS`, or None.
 
         Args:
             images: (C, H, W, 3) BGR; if it is empty, frozen cameras are found from the masks alone.
@@ -101,27 +110,44 @@ class ImageHealth(Stateful[HealthState]):
         given = images.size > 0
         # the green channel suffices
         shown = images[:, step // 2 :: step, step // 2 :: step, 1].copy() if given else small * np.uint8(255)
-        found: list[str | None] = [None] * C
-        self.moved = np.full(C, np.nan)
-        if given:
-            self.moved = self._shift.look(images, masks, doubtful)
-            for c in np.flatnonzero(shown.reshape(C, -1).std(axis=1) < _BLANK_LEVELS).tolist():
-                found[c] = BLANK
-            for c in np.flatnonzero(self.moved > MOST_SHIFT).tolist():
-                found[c] = found[c] or MOVED
-        if self._references is None or self._masks is None or self._references.shape != shown.shape:
-            self._references, self._masks = shown, np.repeat(small[None], C, axis=0)
+        self.moved = self._shift.look(images, masks, doubtful) if given else np.full(C, np.nan)
+        look = _Look(shown, small, given)
+        faulty = {name: measure(self, look) for name, (_, measure) in IMAGE_FAULTS.items()}
+        return [next((name for name, cameras in faulty.items() if cameras[c]), None) for c in range(C)]
+
+    def _blank(self, look: _Look) -> NDArray[np.bool_]:
+        """Return (C,) cameras whose image has one colour."""
+        return look.given & np.asarray(look.shown.reshape(len(look.shown), -1).std(axis=1) < _BLANK_LEVELS)
+
+    def _has_moved(self, _: _Look) -> NDArray[np.bool_]:
+        """Return (C,) cameras whose image is elsewhere than in the first frame."""
+        return np.asarray(self.moved > MOST_SHIFT)
+
+    def _frozen(self, look: _Look) -> NDArray[np.bool_]:
+        """Return (C,) cameras whose image stands still while the others see movement; take the others for
+        references."""
+        C, found = len(look.shown), np.zeros(len(look.shown), np.bool_)
+        if self._references is None or self._masks is None or self._references.shape != look.shown.shape:
+            self._references, self._masks = look.shown, np.repeat(look.small[None], C, axis=0)
             return found
-        differs = cv2.absdiff(shown, self._references) > _SAME_LEVELS
+        differs = cv2.absdiff(look.shown, self._references) > _SAME_LEVELS
         still = differs.reshape(C, -1).mean(axis=1) <= _SAME_SHARE
         for c in range(C):
             if not still[c]:
-                self._references[c], self._masks[c] = shown[c], small
-            elif found[c] is None and small[c].any():  # a mask without anybody cannot move
-                others = [_changed(self._masks[c][k], small[k]) > _MOVED for k in range(C) if k != c and not still[k]]
-                if 2 * len(others) >= C - 1 and np.mean(others) > 0.5:
-                    found[c] = FROZEN
+                self._references[c], self._masks[c] = look.shown[c], look.small
+            elif look.small[c].any():  # a mask without anybody cannot move
+                now = [_changed(self._masks[c][k], look.small[k]) > _MOVED for k in range(C) if k != c and not still[k]]
+                found[c] = 2 * len(now) >= C - 1 and np.mean(now) > 0.5
         return found
+
+
+#: faults of an image by their names, the first that applies counts: text for the user, and the measure, which returns
+#: (C,) the cameras that have it
+IMAGE_FAULTS: Mapping[str, tuple[str, Callable[[ImageHealth, _Look], NDArray[np.bool_]]]] = {
+    "blank": ("shows nothing", ImageHealth._blank),
+    MOVED: ("has been moved since the first frame", ImageHealth._has_moved),
+    "frozen": ("stands still", ImageHealth._frozen),
+}
 
 
 def sampled(images: NDArray[np.uint8], masks: NDArray[np.uint8]) -> Sampled:

@@ -173,7 +173,9 @@ class MaskAgreement:
         C = len(self.rig)
         if there is None:
             there = np.ones((len(frames), C), np.bool_)
-        frames = [masks if here.all() else masks * here[:, None, None] for masks, here in zip(frames, there, strict=True)]
+        frames = [
+            masks if here.all() else masks * here[:, None, None] for masks, here in zip(frames, there, strict=True)
+        ]
         outlines = [[_outline(camera, masks[c]) for c, camera in enumerate(self.rig)] for masks in frames]
         pairs = tangency(outlines, self.rig.centers)
         error = excess(pairs)
@@ -368,9 +370,7 @@ def _outline(camera: Camera, mask: Masks) -> Outline | None:
     return Outline.of(camera, mask)
 
 
-def _silhouettes(
-    views: Sequence[tuple[Bool, Hull]], camera: int, others: Sequence[int]
-) -> list[tuple[Bool, Bool]]:
+def _silhouettes(views: Sequence[tuple[Bool, Hull]], camera: int, others: Sequence[int]) -> list[tuple[Bool, Bool]]:
     """Return a camera's mask, and the silhouette of the hull of some others, of each frame in which one of them sees
     anything."""
     return [
