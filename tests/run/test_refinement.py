@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -37,6 +39,8 @@ from tk.run.refined_calibration import refine_capture
 from tk.run.refinement import BetterCameras
 from tk.settings import Settings
 from tk.trackers.camera_monitor import CameraMonitor
+from tk.trackers.protocol import Estimate, Frame
+from tk.trackers.reason import Reason
 
 TURNED = 1.0  # degrees, of cam2; a camera with a larger error is excluded
 
@@ -256,7 +260,9 @@ def test_landmarks_of_late_cameras_come_from_other_frames() -> None:
     assert retimed_landmarks(None, frames, np.array([0, 1, 0])) is None
 
 
-def judged(displacement: list[float], sigma: float = 0.01, blind: int = 0) -> tuple[Any, list[str]]:
+def judged(
+    displacement: list[float], sigma: float = 0.01, blind: int = 0, first: Reason = Reason.NONE
+) -> tuple[Any, list[str]]:
     """Return the draft, and the notes, of frames with displacements of body and mask in four cameras, of which the
     last ones saw nobody."""
     F, notes = len(displacement), list[str]()
@@ -264,10 +270,11 @@ def judged(displacement: list[float], sigma: float = 0.01, blind: int = 0) -> tu
     half[:, 4 - blind :] = np.nan
     columns = {
         "residual": half,
-        "joints/sigma": np.full((F, 15), sigma),
+        "evidence/sigma": np.full((F, 15), sigma),
         "joints/position": np.zeros((F, 15, 3)),
-        "status": np.zeros(F, np.uint8),
-        "evidence/reason": np.zeros(F, np.uint8),
+        "evidence/reason": np.full(F, first, np.uint8),
+        "evidence/found": np.zeros(F, np.uint8),
+        "evidence/origin": np.array([Status.RECOVERED, *(F - 1) * [Status.TRACKED]], np.uint8),
     }
     result: Any = SimpleNamespace(frames=np.arange(F), **dict.fromkeys(finish.COLUMNS.values()))
     draft = finish._Draft(result, np.zeros(F, np.bool_), np.zeros(F, np.bool_), columns)
@@ -278,8 +285,53 @@ def judged(displacement: list[float], sigma: float = 0.01, blind: int = 0) -> tu
     return draft, notes
 
 
+def test_frame_that_is_judged_again_has_the_sigma_of_the_first_pass() -> None:
+    draft, notes = judged(20 * [0.05], sigma=0.2, first=Reason.CONTRADICTED)
+    assert not draft.columns["evidence/reason"].any() and notes == []
+    np.testing.assert_array_equal(draft.columns["joints/sigma"], 0.2)
+    again, _ = judged(20 * [0.6], sigma=0.2)
+    assert np.isnan(again.columns["joints/sigma"]).all() and (again.columns["evidence/sigma"] == 0.2).all()
+    assert (again.columns["status"] == Status.SUSPECT).all()
+    both = finish.sigma_of_both(np.array([0.23, 0.03, np.nan]), np.array([0.02, 0.02, 0.0]))
+    np.testing.assert_array_equal(both, [0.23, 0.02, np.nan])
+
+
+def test_person_who_is_tracked_again_by_other_trackers_is_judged_as_in_the_first_pass(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig, zeros = ring_of_cameras(4, 8, 6), np.zeros((6, 8), np.uint8)
+
+    class Observed:
+        def frames(self, begin: int, stop: int) -> Iterator[tuple[Frame, dict[str, float]]]:
+            return ((Frame(i, np.zeros((4, 6, 8, 3), np.uint8), np.stack(4 * [zeros])), {}) for i in range(begin, stop))
+
+    class Jumping:
+        tracks_among_others = False
+
+        def step(self, frame: Frame) -> Estimate:
+            at = np.full((15, 3), 9.0 if frame.index == 3 else 0.0)
+            whole, none = np.full((4, 2), 0.02), np.zeros(1, np.int32)
+            return Estimate(np.zeros(5), at, Status.TRACKED, 0.0, none, {}, deviation=np.full(15, 0.01), residual=whole)
+
+    monkeypatch.setattr(finish, "open_observations", lambda *_: nullcontext(Observed()))
+    draft, _ = judged(6 * [0.05])
+    given = {"pose": np.zeros((6, 5)), "objective": np.zeros(6), "evidence/camera": np.zeros((6, 4), np.uint8)}
+    result: Any = SimpleNamespace(frames=np.arange(6), status=np.zeros(6, np.uint8))
+    draft = replace(draft, result=result, columns=draft.columns | given)
+    task: Any = SimpleNamespace(settings=Settings(), setup=SimpleNamespace(rig=rig, fps=15.0))
+    finisher = finish._Finisher(task, True, print, lambda _: None, SimpleNamespace(rig=rig))  # type: ignore[arg-type]
+    tracker: Any = Jumping()
+    (found,) = finisher._tracked_by([tracker], draft, np.zeros((6, 4), np.bool_))
+    assert found.lost.tolist() == [False, False, False, True, False, False]
+    assert found.columns["evidence/found"].tolist() == [0, 0, 0, Reason.JUMPS, 0, 0]
+
+
 def test_cameras_from_opposite_sides_leave_sigma_unknown_and_are_named_as_the_cause() -> None:
     draft, (note,) = judged(20 * [0.05], blind=3)
-    assert np.isnan(draft.columns["joints/sigma"]).all() and not draft.columns["status"].any()
+    assert np.isnan(draft.columns["joints/sigma"]).all()
+    assert (
+        draft.columns["status"].tolist() == [Status.RECOVERED, *19 * [Status.TRACKED]]
+        and (draft.columns["evidence/sigma"] == 0.01).all()
+    )
     assert "from opposite sides" in note and "frames 0 to 19" in note
     assert judged(20 * [0.05], blind=2)[1] == []

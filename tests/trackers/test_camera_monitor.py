@@ -19,13 +19,15 @@ from tk.io import settings_file
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.results.codec import decode, encode
 from tk.io.results.reader import read_joints
+from tk.io.results.status import Status
 from tk.model.body.joint_sigma import VIEW_M
 from tk.model.cameras.common_view import LEAST_INFORMATION, depth_information
 from tk.model.masks.mask_agreement import Agreement
 from tk.model.setup import Subject
 from tk.trackers.camera_monitor import CameraMonitor, MonitorState, opening_agreement
-from tk.trackers.judgement import STATES, report_frames
+from tk.trackers.judgement import STATES
 from tk.trackers.protocol import Estimate, Frame
+from tk.trackers.reason import Reason, report_frames
 from tk.trackers.region import RegionTracker
 
 CONFIG = settings_file.from_toml(FITTED)
@@ -175,6 +177,20 @@ def test_sigma_is_unknown_while_the_cameras_left_face_each_other(scene: Scene) -
     assert not any(e.status == "lost" for e in estimates)
 
 
+def test_status_is_that_of_the_step_without_the_wrong_camera(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the wrong camera, the person seems to be elsewhere."""
+    step = RegionTracker.step
+
+    def elsewhere(tracker: RegionTracker, frame: Frame) -> Estimate:
+        estimate = step(tracker, frame)
+        wrong = frame.index == 5 and frame.masks[1].any()
+        return replace(estimate, origin=Status.RECOVERED, found=Reason.CUT) if wrong else estimate
+
+    monkeypatch.setattr(RegionTracker, "step", elsewhere)
+    _, estimates, used = scene.follow(moved(1, range(5, 10)))
+    assert not used[5][1] and (estimates[5].status, estimates[5].reason) == ("tracked", Reason.NONE)
+
+
 def test_frozen_and_black_cameras_are_excluded_and_reported(scene: Scene) -> None:
     def spoil(frame: Frame) -> Frame:
         images, masks = frame.images.copy(), frame.masks.copy()
@@ -211,7 +227,7 @@ def test_person_who_is_elsewhere_without_having_been_lost_is_reported(
 
     def jump(tracker: RegionTracker, frame: Frame) -> Estimate:
         estimate = step(tracker, frame)
-        return replace(estimate, status="recovered") if frame.index == 7 else estimate
+        return replace(estimate, origin=Status.RECOVERED, found=Reason.CUT) if frame.index == 7 else estimate
 
     monkeypatch.setattr(RegionTracker, "step", jump)
     expected = "elsewhere than in the frame before, as after a cut in the recording: searched for again, frame 7"
@@ -336,7 +352,7 @@ class Jumping:
     def step(self, frame: Frame) -> Estimate:
         at = self.joints + (np.array([4.0, 0.0, 0.0]) if frame.index == self.when else 0.0)
         none = np.zeros(0, np.int32)
-        return Estimate(np.zeros(24), at, "tracked", 0.0, none, {}, sigma=np.full(15, 0.01))
+        return Estimate(np.zeros(24), at, Status.TRACKED, 0.0, none, {}, deviation=np.full(15, 0.01))
 
 
 def test_impossible_pose_is_lost(scene: Scene) -> None:

@@ -2,36 +2,53 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
+import pytest
+
+from tk.io.results.codec import decode, encode
 from tk.io.results.status import Status
 from tk.kernels.mask_values import OTHERS
+from tk.model.body import gait_poses as gait
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.skeleton import build_skeleton
 from tk.trackers.camera_monitor import touched_by_others
 from tk.trackers.judgement import (
-    CONSEQUENCES,
     UNKNOWN_AFTER,
     FrameEvidence,
-    Reason,
-    is_status,
+    FrameJudge,
+    JudgeState,
+    Match,
+    impossible,
     judge_frames,
     likelihoods,
-    report_frames,
 )
-from tk.trackers.residual import LEVEL, RECENT, displacement, variance_factor
+from tk.trackers.protocol import Estimate
+from tk.trackers.reason import CONSEQUENCES, Reason, is_lost, known_sigma, report_frames, status_of
+from tk.trackers.residual import LEVEL, LEVEL_SPREADS, RATE, RECENT, displacement, level_spread, variance_factor
 
 VIEWS = 4
 
 
 def judged(
-    residual: np.ndarray, found: dict[int, Reason] | None = None, one_sided: bool = False, whole: bool = True
+    residual: np.ndarray,
+    found: dict[int, Reason] | None = None,
+    one_sided: bool = False,
+    whole: bool = True,
+    begins: int | None = None,
 ) -> np.ndarray:
-    """Return the reasons of frames with these residuals (F, V, 2) and first reasons."""
+    """Return the reasons of frames with these residuals (F, V, 2) and first reasons; in ``begins`` the person is found
+    elsewhere."""
     F = len(residual)
     first = np.zeros(F, np.uint8)
     for frame, reason in (found or {}).items():
         first[frame] = reason
-    posed = ~is_status(first, Status.LOST)
-    return judge_frames(FrameEvidence(first, posed, residual, np.full(F, not one_sided)), 0.02, whole)
+    posed = np.array([not is_lost(Reason(reason)) for reason in first])
+    start = np.arange(F) == begins
+    return judge_frames(FrameEvidence(first, posed, start, residual, np.full(F, not one_sided)), 0.02, whole)
 
 
 def suspect(residual: np.ndarray) -> np.ndarray:
@@ -63,6 +80,29 @@ def test_only_frames_about_a_lasting_high_residual_are_suspect() -> None:
     assert not suspect(short).any()
     found = np.flatnonzero(suspect(lasting))
     assert set(range(5, 11)) <= set(found) <= set(range(2, 14))
+
+
+@pytest.mark.parametrize("lost", [True, False])
+@pytest.mark.parametrize("whole", [True, False])
+def test_frames_before_a_loss_or_a_cut_are_no_evidence_about_those_after_it(lost: bool, whole: bool) -> None:
+    residual = residuals(0.04, 0.05, 20)
+    residual[:8] = 0.4
+    found = {8: Reason.NOBODY} if lost else {}
+    reasons = judged(residual, found, whole=whole, begins=9 if lost else 8)
+    assert (reasons[:8] == Reason.CONTRADICTED).all() and not reasons[9 if lost else 8 :].any()
+    if whole:  # a residual that stays high counts from its first frame, not from before the loss
+        high = judged(residuals(0.04, 0.05, 40), {10: Reason.HIGH, **({8: Reason.NOBODY} if lost else {})}, begins=9)
+        assert np.flatnonzero(high == Reason.HIGH).tolist() == [9, 10]
+
+
+def test_mean_of_fewer_frames_has_a_wider_limit() -> None:
+    """A still has the limit of one frame, three standard deviations of a single one above the level."""
+    spreads = [level_spread(frames) for frames in range(1, RECENT + 1)]
+    assert (spreads[0], spreads[-1]) == LEVEL_SPREADS and spreads == sorted(spreads, reverse=True)
+    half = 0.235 / 2
+    assert not suspect(residuals(half, half, 1)).any() and suspect(residuals(half, half, RECENT)).all()
+    # in the first frames of a recording, and in the first ones after a cut, as few count
+    assert not judged(residuals(half, half, RECENT + 2), whole=False, begins=RECENT)[RECENT:].any()
 
 
 def test_unmeasured_frames_and_views_do_not_count() -> None:
@@ -99,6 +139,94 @@ def test_first_reason_counts() -> None:
     right = judged(residuals(0.02, 0.02, 4), found, whole=False)
     assert right.tolist() == [Reason.UNCLEAR, Reason.CUT, Reason.NONE, Reason.NONE]
     assert (judged(residuals(0.02, 0.02, 4), one_sided=True) == Reason.ONE_SIDED).all()
+
+
+def test_numbers_of_a_tracker_have_one_reason() -> None:
+    assert Match(0.2, 0.4).reason == Reason.NONE
+    assert Match(np.inf, 0.4).reason == Reason.NOBODY
+    assert Match(0.5, 0.4, lost_for=3, excess=9.0).reason == Reason.UNEXPLAINED
+    assert Match(0.2, 0.4, excess=3.0).reason == Reason.NONE
+    for again in (Match(0.2, 0.4, 1.5, cut=True), Match(0.2, 0.4, 1.5, lost_for=1), Match(0.2, 0.4, 1.5, lost_for=99)):
+        assert again.reason == Reason.STILL_HIGH
+    later = Match(0.2, 0.4, 3.0, cut=True, refused=round(1 / RATE), false_alarm=0.02)
+    assert later.reason == Reason.CUT and replace(later, excess=4.0).reason == Reason.STILL_HIGH
+    assert replace(later, high_for=UNKNOWN_AFTER).reason == Reason.HIGH
+    assert replace(later, high_for=UNKNOWN_AFTER, depth=False).reason == Reason.ONE_SIDED
+
+
+def estimate(joints: np.ndarray, residual: float = 0.05, **fields: Any) -> Estimate:
+    whole = np.full((VIEWS, 2), residual / 2)
+    given = {"origin": Status.TRACKED, "residual": whole, "deviation": np.full(15, 0.02), **fields}
+    return Estimate(np.zeros(9), joints, objective=0.1, iterations=np.zeros(1, np.int32), timing={}, **given)
+
+
+def frame_judge(fps: float = 15.0) -> FrameJudge:
+    tracker: Any = SimpleNamespace(tracks_among_others=False)
+    return FrameJudge(tracker, VIEWS, fps, 0.02)
+
+
+SKELETON = build_skeleton(BodyDimensions.from_stature(1.75), "z")
+
+
+def joints(x: float = 0.0, z: float = 0.95, yaw_deg: float = 0.0, phase: float = 0.0) -> np.ndarray:
+    pose = gait.walking_pose(SKELETON, phase % 1)
+    pose[:3] = x, 0.0, z
+    pose[SKELETON.index("torso_yaw")] = np.radians(yaw_deg)
+    return SKELETON.joints(pose)
+
+
+def test_walking_turning_jumping_and_sprinting_are_possible() -> None:
+    before = None
+    for i in range(30):
+        now = joints(0.5 * i, 0.95 + 0.5 * max(0.0, np.sin(i / 3)), 40.0 * i, i / 10)
+        assert impossible(now, before, 1 / 15) == Reason.NONE, i
+        before = now
+
+
+@pytest.mark.parametrize(("then", "reason"), [(joints(x=3.0), Reason.JUMPS), (joints() * np.nan, Reason.NO_NUMBERS)])
+def test_impossible_pose_is_lost_and_not_compared_with_the_next(then: np.ndarray, reason: Reason) -> None:
+    judge = frame_judge()
+    assert judge.judge(0, estimate(joints())).status == "tracked"
+    lost = judge.judge(1, estimate(then))
+    assert (lost.found, lost.reason, lost.status) == (reason, reason, "lost")
+    assert judge.judge(2, estimate(joints(x=5.0))).status == "tracked"
+
+
+def test_person_who_is_recovered_may_be_anywhere_and_keeps_this_status_unless_suspect() -> None:
+    judge = frame_judge(60.0)
+    for frame in range(RECENT):
+        assert judge.judge(frame, estimate(joints(), 0.6)).status == "suspect"
+    cut = judge.judge(RECENT, estimate(joints(x=5.0), origin=Status.RECOVERED, found=Reason.CUT))
+    assert (cut.status, cut.reason) == ("recovered", Reason.CUT)
+    suspected = judge.judge(RECENT + 1, estimate(joints(x=5.0), 2.0, origin=Status.INITIALISED))
+    assert suspected.status == "suspect" and suspected.origin == Status.INITIALISED
+
+
+def test_judge_that_is_restored_says_the_same() -> None:
+    judge, again = frame_judge(), frame_judge()
+    judge.judge(4, estimate(joints(), 0.3))
+    again.state = decode(JudgeState, encode(judge.state))
+    for then in (estimate(joints(x=3.0)), estimate(joints(x=0.1), 0.3)):
+        assert again.judge(5, then).reason == judge.judge(5, then).reason
+
+
+def test_sigma_is_kept_as_computed_and_hidden_by_the_reason() -> None:
+    suspected = frame_judge().judge(0, estimate(joints(), 0.9))
+    assert suspected.reason == Reason.CONTRADICTED and suspected.sigma is not None and suspected.deviation is not None
+    assert np.isnan(suspected.sigma).all() and (suspected.deviation == 0.02).all()
+    hidden = known_sigma(np.ones((len(Reason), 15)), np.arange(len(Reason)))
+    known = [then.sigma for then in CONSEQUENCES.values()]
+    assert np.isfinite(hidden).all(axis=1).tolist() == known and np.isnan(hidden).all(axis=1).tolist() == [
+        not one for one in known
+    ]
+
+
+def test_status_follows_from_how_the_pose_was_found_and_from_the_reason() -> None:
+    found = status_of(
+        np.array([Status.RECOVERED, Status.RECOVERED, Status.INITIALISED, Status.TRACKED, Status.ABSENT]),
+        np.array([Reason.NONE, Reason.UNCLEAR, Reason.HIGH, Reason.JUMPS, Reason.NOBODY]),
+    )
+    assert found.tolist() == [Status.RECOVERED, Status.SUSPECT, Status.INITIALISED, Status.LOST, Status.ABSENT]
 
 
 def test_every_reason_has_a_consequence_and_who_has_no_pose_has_no_sigma() -> None:

@@ -35,6 +35,7 @@ from tk.run.session import Summary, estimates
 from tk.run.task import RecordingOptions, Task
 from tk.trackers.bodies import body_and_poses, read_body
 from tk.trackers.protocol import Estimate, Frame
+from tk.trackers.reason import Reason
 from tk.trackers.region import RegionTracker
 
 CONFIG = settings_file.from_toml(QUICK)
@@ -288,7 +289,7 @@ def test_frames_without_known_joints_are_reported(
 
     def unsure(tracker: RegionTracker, frame: Frame) -> Estimate:
         estimate = step(tracker, frame)
-        return replace(estimate, sigma=np.full(15, np.nan)) if frame.index in (2, 3) else estimate
+        return replace(estimate, found=Reason.HIGH) if frame.index in (2, 3) else estimate
 
     monkeypatch.setattr(RegionTracker, "step", unsure)
     reporter = Silent()

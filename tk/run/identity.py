@@ -176,8 +176,8 @@ def _with_rows(to: Result, rows: NDArray[np.int64], source: Result, other: NDArr
         if values is not None:
             columns[name] = values.copy()
             columns[name][rows] = getattr(source, name)[other]
-    status = columns["status"]
-    status[rows[status[rows] == Status.INITIALISED]] = Status.TRACKED
+    for name in {"status", "origin"} & columns.keys():
+        columns[name][rows[columns[name][rows] == Status.INITIALISED]] = Status.TRACKED
     return replace(to, **columns)
 
 
@@ -185,5 +185,6 @@ def _with_rows(to: Result, rows: NDArray[np.int64], source: Result, other: NDArr
 COLUMNS = {
     "pose": "pose", "joints/position": "joints", "joints/sigma": "sigma", "residual": "residual", "status": "status",
     "objective": "objective", "landmarks": "landmarks", "evidence/reason": "reason",
-    "evidence/camera": "camera_state",
+    "evidence/camera": "camera_state", "evidence/found": "found", "evidence/origin": "origin",
+    "evidence/sigma": "deviation",
 }  # fmt: skip

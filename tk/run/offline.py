@@ -26,17 +26,9 @@ from tk.run.prefetch import open_observations
 from tk.run.refinement import compare_cameras, refine_if_inconsistent
 from tk.run.second_run import Run, Used, explains_better, track_again
 from tk.run.task import Task
-from tk.trackers.judgement import (
-    FrameEvidence,
-    Reason,
-    depth_known,
-    first_reason,
-    is_status,
-    judge_frames,
-    report_frames,
-    sigma_known,
-)
+from tk.trackers.judgement import FrameEvidence, FrameJudge, depth_known, judge_frames
 from tk.trackers.protocol import Estimate, TwoPassTracker, two_pass, without_cameras
+from tk.trackers.reason import Reason, known_sigma, report_frames, status_of
 
 _LOG = logging.getLogger(__name__)
 Float = NDArray[np.float64]
@@ -128,17 +120,18 @@ class _Draft:
         return self.columns.get(dataset, getattr(self.result, COLUMNS[dataset]))
 
     def replace(self, rows: NDArray[np.int64], estimates: Sequence[Estimate]) -> None:
-        """Take other estimates for some frames; the first frame's status stays "initialised"."""
-        datasets = ("pose", "joints/sigma", "residual", "objective", "status", "evidence/reason", "evidence/camera")
+        """Take other estimates for some frames; the first frame stays "initialised"."""
+        evidence = ("reason", "found", "origin", "sigma", "camera")
+        datasets = ("pose", "residual", "objective", *(f"evidence/{name}" for name in evidence))
         columns = {dataset: self.current(dataset).copy() for dataset in datasets}
         for row, e in zip(rows, estimates, strict=True):
             columns["pose"][row], columns["objective"][row] = e.pose, e.objective
-            columns["joints/sigma"][row], columns["residual"][row] = e.sigma, e.residual
-            columns["evidence/reason"][row] = e.reason
+            columns["evidence/sigma"][row], columns["residual"][row] = e.deviation, e.residual
+            columns["evidence/reason"][row], columns["evidence/found"][row] = e.reason, e.found
             if e.cameras is not None:  # else those of the first pass were left out
                 columns["evidence/camera"][row] = e.cameras
-            if columns["status"][row] != Status.INITIALISED:
-                columns["status"][row] = Status[e.status.upper()]
+            if columns["evidence/origin"][row] != Status.INITIALISED:
+                columns["evidence/origin"][row] = e.origin
             self.lost[row] = e.status == "lost"
         self.columns |= columns
 
@@ -210,12 +203,8 @@ class _Finisher:
             or (self.alone and subject.init is None and subject.in_init_pose and not turned),
             report=self.within,
         )
-        # a much larger sigma of the first pass, or NaN: it tracked several poses, or did not find a limb
-        before = draft.current("joints/sigma")
-        again_known = np.isin(draft.current("evidence/reason"), (Reason.CONTRADICTED, Reason.ONE_SIDED))
-        before = np.where(again_known[:, None], 0.0, before)  # these are judged again
-        sigma = np.where((before > _LESS_SURE * precise) | np.isnan(before), before, precise)
-        draft.columns |= {"pose": poses, "residual": residual, "joints/sigma": sigma}
+        sigma = sigma_of_both(draft.current("evidence/sigma"), precise)
+        draft.columns |= {"pose": poses, "residual": residual, "evidence/sigma": sigma}
         return tracker
 
     def _with_true_heading(
@@ -269,15 +258,16 @@ class _Finisher:
         are unused; return a draft of each."""
         present = np.flatnonzero(draft.result.status != Status.ABSENT)
         rows = dict(zip(draft.result.frames[present].tolist(), present.tolist(), strict=True))
+        rig, false_alarm = self.task.setup.rig, self.task.settings.region.false_alarm
+        judges = [FrameJudge(tracker, len(rig), self.task.setup.fps, false_alarm) for tracker in trackers]
         found: list[list[Estimate]] = [[] for _ in trackers]
         with open_observations(self.task, lambda _: None) as observations:
             for frame, _ in observations.frames(min(rows), max(rows) + 1):
                 if frame.index in rows:
                     used = without_cameras(frame, unused[rows[frame.index]])
-                    for tracker, estimates in zip(trackers, found, strict=True):
-                        found_one = tracker.step(used)
-                        reason = int(first_reason(found_one.status, found_one.sigma))
-                        estimates.append(replace(found_one, reason=reason, masks=None, drawn=None))  # these are large
+                    for tracker, judge, estimates in zip(trackers, judges, found, strict=True):
+                        found_one = judge.judge(frame.index, tracker.step(used))
+                        estimates.append(replace(found_one, masks=None, drawn=None))  # these are large
                     self.within(len(found[0]) / len(rows))
         drafts = [replace(draft, lost=draft.lost.copy(), columns=dict(draft.columns)) for _ in trackers]
         for one, estimates in zip(drafts, found, strict=True):
@@ -376,19 +366,23 @@ class _Finisher:
 
     def _judge(self, draft: _Draft, second_pass: bool) -> None:
         """Give the frames of a draft the reasons, the status and the sigma that all frames together imply."""
-        posed, residual = ~draft.lost, draft.current("residual")
-        found = draft.current("evidence/reason")
-        found = np.where(posed & draft.unclear, np.uint8(Reason.UNCLEAR), found)
+        posed, residual, origin = ~draft.lost, draft.current("residual"), draft.current("evidence/origin")
+        reasons = draft.current("evidence/reason")
         if second_pass and residual is not None:  # without one, no frame depends on later ones
+            found, begins = draft.current("evidence/found"), origin == Status.RECOVERED
             depth = depth_known(self.cameras.rig, draft.current("joints/position"), residual)
-            evidence = FrameEvidence(found, posed, residual, depth)
-            found = judge_frames(evidence, self.task.settings.region.false_alarm, whole=True)
-        status, sigma = draft.current("status"), draft.current("joints/sigma")
-        status = np.where(status == Status.SUSPECT, np.uint8(Status.TRACKED), status)
-        status = np.where(is_status(found, Status.SUSPECT), np.uint8(Status.SUSPECT), status)
-        draft.columns |= {"evidence/reason": found, "status": status}
-        if sigma is not None:
-            draft.columns["joints/sigma"] = np.where(sigma_known(found)[:, None], sigma, np.nan)
+            evidence = FrameEvidence(found, posed, begins, residual, depth)
+            reasons = judge_frames(evidence, self.task.settings.region.false_alarm, whole=True)
+        reasons = np.where(posed & draft.unclear, np.uint8(Reason.UNCLEAR), reasons)
+        draft.columns |= {"evidence/reason": reasons, "status": status_of(origin, reasons)}
+        if (sigma := draft.current("evidence/sigma")) is not None:
+            draft.columns["joints/sigma"] = known_sigma(sigma, reasons)
+
+
+def sigma_of_both(first: Float, second: Float) -> Float:
+    """Return sigma (F, J), metres, of the second pass, or of the first one where that is much larger or NaN: it tracked
+    several poses, or did not find a limb."""
+    return np.where(first <= _LESS_SURE * second, second, first)
 
 
 def _report(frames: NDArray[np.int64], reasons: NDArray[np.uint8] | None, note: Note, person: int, alone: bool) -> None:

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ConfigError
+from tk.io.results.status import Status
 from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.body.skeleton import JOINTS
 from tk.model.cues.part_colors import RenderedBody
@@ -37,6 +38,7 @@ from tk.run.one_person import really_there
 from tk.run.task import Task
 from tk.trackers.camera_monitor import CameraMonitor, spread_over
 from tk.trackers.protocol import Estimate, Frame, Tracker, sharing
+from tk.trackers.reason import Reason
 from tk.trackers.sharing import UNKNOWN_BY_HULLS, PixelOwners, assign, cast_points, matched_bodies
 
 _LOG = logging.getLogger(__name__)
@@ -329,7 +331,7 @@ class People:
         volume could not be tracked.
         """
         if not self._tracked and not self._awaited:
-            return self._nobody(frame, "lost" if self._refused else "absent")
+            return self._nobody(frame, lost=self._refused > 0)
         owners: PixelOwners | None = None
         if len(self._tracked) == 1 and not self._tracked[0].shows_others(frame.masks, self._setup.rig):
             (member,) = self._tracked
@@ -344,8 +346,8 @@ class People:
         for member in self._tracked:
             if member.absent:
                 answer = answers[member.number]
-                answers[member.number] = replace(answer, estimate=replace(answer.estimate, status="absent"))
-        return {m.number: answers[m.number] for m in self.members} or self._nobody(frame, "absent")
+                answers[member.number] = replace(answer, estimate=replace(answer.estimate, origin=Status.ABSENT))
+        return {m.number: answers[m.number] for m in self.members} or self._nobody(frame)
 
     def _step_all(self, frame: Frame) -> tuple[dict[int, Tracked], PixelOwners]:
         """Return the answers of all members, and the owners of the pixels at the poses that were expected."""
@@ -477,9 +479,11 @@ class People:
         self._refused += 1
         self._admit_from = frame + self._every * min(2 ** (self._refused - 1), _LONGEST_PAUSE)
 
-    def _nobody(self, frame: Frame, status: str) -> dict[int, Tracked]:
-        """Return the answers in a frame before somebody who is in the result is tracked."""
-        return {} if self.several else {0: Tracked(replace(self._no_pose, status=status), frame, frame)}
+    def _nobody(self, frame: Frame, lost: bool = False) -> dict[int, Tracked]:
+        """Return the answers in a frame before anybody in the result is tracked; ``lost``: somebody is there."""
+        absent = self._no_pose
+        lost_one = replace(absent, origin=Status.TRACKED, found=Reason.UNEXPLAINED)
+        return {} if self.several else {0: Tracked(lost_one if lost else absent, frame, frame)}
 
     @cached_property
     def _no_pose(self) -> Estimate:
@@ -487,11 +491,11 @@ class People:
         return Estimate(
             pose=np.full(len(tracker.pose_names), np.nan),
             joints=np.full((len(JOINTS), 3), np.nan),
-            status="absent",
+            origin=Status.ABSENT,
             objective=np.nan,
             iterations=np.zeros(len(tracker.stages), np.int32),
             timing=dict.fromkeys(tracker.timing_stages, 0.0),
-            sigma=np.full(len(JOINTS), np.nan) if tracker.reports_sigma else None,
+            deviation=np.full(len(JOINTS), np.nan) if tracker.reports_sigma else None,
             residual=np.full((views, 2), np.nan) if tracker.reports_sigma else None,
         )
 

@@ -25,8 +25,9 @@ from tk.run.prefetch import TIMING_STAGES, Observations, open_observations
 from tk.run.segmentation import mask_source, sees_landmarks, sources_of_masks
 from tk.run.task import RecordingOptions, Task, describe
 from tk.trackers.bodies import read_body
-from tk.trackers.judgement import MEANINGS, STATE_MEANINGS
+from tk.trackers.judgement import STATE_MEANINGS
 from tk.trackers.protocol import Tracker
+from tk.trackers.reason import MEANINGS
 from tk.trackers.registry import tracker_class
 
 _LOG = logging.getLogger(__name__)

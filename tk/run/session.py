@@ -26,8 +26,8 @@ from tk.run.plan import open_plan, recording_task
 from tk.run.reporter import Reporter
 from tk.run.task import RecordingOptions, Task
 from tk.threads import one_thread
-from tk.trackers.judgement import report_frames
 from tk.trackers.protocol import Estimate
+from tk.trackers.reason import report_frames
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
-from tk.io.results.status import Status
 from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.body.joint_sigma import VIEW_M
-from tk.model.body.plausibility import LastAccepted, Plausibility, check_extent, check_stature
-from tk.model.body.skeleton import JOINTS
+from tk.model.body.plausibility import check_extent, check_stature
 from tk.model.cameras.common_view import determine_depth
 from tk.model.cameras.landmark_agreement import evidence_for_cameras
 from tk.model.cues.ray_costs import residual_of
@@ -32,23 +30,9 @@ from tk.model.masks.mask_agreement import Agreement, MaskAgreement
 from tk.model.masks.regions import SQUARE3
 from tk.model.setup import Setup, Subject
 from tk.model.stateful import Stateful
-from tk.trackers.judgement import (
-    CONSEQUENCES,
-    FAULTS,
-    STATES,
-    WRONG,
-    Belief,
-    Cameras,
-    FrameEvidence,
-    Reason,
-    depth_known,
-    first_reason,
-    is_status,
-    judge_frames,
-    likelihoods,
-    refused,
-)
-from tk.trackers.protocol import Estimate, Frame, Tracker, sharing, shows_person, without_cameras
+from tk.trackers.judgement import FAULTS, STATES, WRONG, Belief, Cameras, FrameJudge, JudgeState, likelihoods
+from tk.trackers.protocol import Estimate, Frame, Tracker, shows_person, without_cameras
+from tk.trackers.reason import Reason, is_lost
 from tk.trackers.region import RegionTracker
 
 Float = NDArray[np.float64]
@@ -98,24 +82,18 @@ class MonitorState:
 
     Attributes:
         cameras: what is believed of them.
-        refused: poses refused since the last accepted one, because of their residual.
-        was_lost: whether the last frame has no pose.
         spans: of exclusion, by "camera/state".
         doubted: (C,) see :class:`CameraMonitor`.
-        recent: what the last frames show.
         opening_reasons: why cameras are excluded from the opening on.
-        health, plausibility: the parts.
+        health, frames: the parts.
     """
 
     cameras: Belief
-    refused: int
-    was_lost: bool
     spans: dict[str, Span]
     doubted: NDArray[np.bool_]
-    recent: FrameEvidence
     opening_reasons: dict[int, str]
     health: HealthState
-    plausibility: LastAccepted
+    frames: JudgeState
 
 
 class CameraMonitor(Stateful[MonitorState]):
@@ -137,17 +115,13 @@ class CameraMonitor(Stateful[MonitorState]):
         self.tracker, self._setup, self._subject = tracker, setup, subject
         self._names = setup.rig.names
         self._health = ImageHealth()
-        self._plausibility = Plausibility(setup.fps)
         C = len(self._names)
         self.doubted = np.zeros(C, bool)
         self._cameras = Cameras(C, setup.fps)
         self._region = tracker if isinstance(tracker, RegionTracker) else None  # only this one has residuals
+        self._frames = FrameJudge(tracker, C, setup.fps, self._region.config.false_alarm if self._region else 0.5)
         self._spans: dict[str, Span] = {}
-        self._recent = FrameEvidence.none(C)
         self._opening_reasons: dict[int, str] = {}
-        self._refused = 0
-        self._was_lost = False
-        self._excess = 0.0  # of this frame, mean over the cameras used; 0 if it was not tested
 
     def start(self, frames: Sequence[Frame], whole: Sequence[Frame] = ()) -> list[Frame]:
         """Return the opening frames without the cameras that are wrong, for the tracker's start.
@@ -204,18 +178,18 @@ class CameraMonitor(Stateful[MonitorState]):
         used = without_cameras(frame, out > 0)
         if np.count_nonzero(shows_person(used.masks)) < 2:
             used = without_cameras(frame, np.ones(len(out), bool))  # one view does not determine depth
-        self._excess = 0.0
         if self._region is not None and np.count_nonzero(~cameras.unfit) >= 3:
             estimate, used = self._weigh(self._region, frame, used)
         else:
             estimate = self.tracker.step(used)
         out = np.where(out > 0, out, cameras.states)
-        estimate = replace(estimate, cameras=out, shift=self._health.moved)
+        estimate = self._frames.judge(frame.index, replace(estimate, cameras=out, shift=self._health.moved))
+        self.doubted |= is_lost(estimate.reason) or estimate.found == Reason.CUT
         for camera, state in enumerate(out.tolist()):
             if state:
                 self.doubted[camera] = True
                 _count(self._spans, f"{camera}/{STATES[state]}", frame.index)
-        return self._judged(frame.index, estimate, used), used
+        return estimate, used
 
     def _weigh(self, tracker: RegionTracker, frame: Frame, used: Frame) -> tuple[Estimate, Frame]:
         """Step the tracker, and judge the cameras by their residuals. Return the estimate and the observation without
@@ -245,12 +219,10 @@ class CameraMonitor(Stateful[MonitorState]):
                 # both poses by a baseline that has not learned this frame from the camera
                 with_it, without = (_likelihoods(tracker, found, touched) for found in (residual, again))
                 if cameras.judge(accused, others, with_it, without):
-                    estimate, used = replace(second, status=estimate.status), fewer
-                    kept, residual = others, again
+                    estimate, used, residual = second, fewer, again
                 else:
                     tracker.state = after
         cameras.weigh(left_out & np.isfinite(residual[:, 0]), _likelihoods(tracker, residual, touched))
-        self._excess = tracker.residuals.mean_excess(np.where(kept, residual.sum(axis=1), np.nan))
         return estimate, used
 
     def _accused(
@@ -281,51 +253,6 @@ class CameraMonitor(Stateful[MonitorState]):
             excused = residual_of(drawn & tracker.screen.sample(frame.uncertain), person, others)[:, 0]
             residual[:, 0] -= np.where(excused < _TOO_LITTLE, excused, 0.0)
         return residual
-
-    def _judged(self, index: int, estimate: Estimate, used: Frame) -> Estimate:
-        """Return the estimate of a frame with the status and the sigma that follow from its reason."""
-        found = self._found(index, estimate, used)
-        if is_status(np.array(found), Status.LOST):
-            self._plausibility.forget()
-            if estimate.status != "lost" and (tracker := sharing(self.tracker)) is not None:
-                tracker.lose()
-            reason = found
-        else:
-            residual = np.full((len(self._names), 2), np.nan) if estimate.residual is None else estimate.residual
-            depth = bool(depth_known(self._setup.rig, estimate.joints, estimate.residual))
-            self._recent = self._recent.then(found, residual, depth)
-            reason = Reason(judge_frames(self._recent, self._false_alarm)[-1])
-        then = CONSEQUENCES[reason]
-        status = estimate.status if then.status is None else then.status.name.lower()
-        self._was_lost = status == "lost"
-        self.doubted |= self._was_lost or found == Reason.CUT
-        unknown = estimate.sigma is not None and not then.sigma
-        sigma = np.full(len(JOINTS), np.nan) if unknown else estimate.sigma
-        return replace(estimate, status=status, reason=int(reason), sigma=sigma)
-
-    def _found(self, index: int, estimate: Estimate, used: Frame) -> Reason:
-        """Return the reason that a frame itself shows."""
-        first = first_reason(estimate.status, estimate.sigma, not shows_person(used.masks).any())
-        if estimate.status == "lost":
-            return first
-        recovered = estimate.status == "recovered"
-        if recovered:  # the person may be elsewhere, as after a cut
-            self._plausibility.forget()
-        reason = self._plausibility.judge(index, estimate.joints)
-        if reason is None and recovered and refused(self._excess, self._refused, self._false_alarm):
-            self._refused += 1
-            return Reason.STILL_HIGH
-        if reason is not None:
-            return Reason[reason]
-        self._refused = 0
-        if recovered and not self._was_lost:
-            return Reason.CUT
-        return first
-
-    @property
-    def _false_alarm(self) -> float:
-        """See :func:`judge_frames`; only region trackers have residuals."""
-        return 0.5 if self._region is None else self._region.config.false_alarm
 
     @property
     def unfit(self) -> NDArray[np.bool_]:

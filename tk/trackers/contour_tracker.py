@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
+from tk.io.results.status import Status
 from tk.kernels.mask_values import PERSON
 from tk.model.body.stored_body import restore_body
 from tk.model.cues.part_colors import LearnedColors, PartColors, RenderedBody, color_bins
@@ -44,6 +45,7 @@ class ContourTracker(ContourFinder, Stateful[S], ABC):
     tracks_among_others = True
 
     _lost_for: int  # consecutive frames, up to the last one, in which the person was lost
+    _fresh: bool  # whether no frame has been tracked yet
 
     @abstractmethod
     def start(self, frames: Sequence[Frame], subject: Subject) -> None:
@@ -64,6 +66,10 @@ class ContourTracker(ContourFinder, Stateful[S], ABC):
     def lose(self) -> None:
         """Take the last frame for lost: the person is searched for in the next one."""
         self._lost_for = max(self._lost_for, 1)
+
+    def _origin(self, cut: bool = False) -> Status:
+        """Return how the tracker came to the pose of this frame. ``cut``: the person is elsewhere than before."""
+        return Status.INITIALISED if self._fresh else Status.RECOVERED if cut or self._lost_for else Status.TRACKED
 
     def rendered(self, ahead: bool) -> RenderedBody:
         """Return the body on the grid :attr:`choice`: at the last pose, or at the one expected in the next frame."""

@@ -12,16 +12,17 @@ A wrong pose explains a high residual, too. So the evidence of one frame is a co
 tracked with the camera and without it (:meth:`Cameras.judge`). A camera that is left out is weighed in each frame at
 the pose that the others give, by forward probabilities (Rabiner, *Proceedings of the IEEE*, 1989).
 
-**Frames.** What a frame itself shows (nobody, an impossible pose, a residual that stays high) is its first reason.
-:func:`judge_frames` adds what several frames show together: body and masks differ more than in a correct recording, or
-the cameras do not determine depth. A run asks it in each frame with the last frames, and at its end with all of them.
+**Frames.** What a frame itself shows is its first reason: the numbers that the tracker reports (:class:`Match`), or a
+pose that is impossible after the last one (:class:`FrameJudge`). :func:`judge_frames` adds what several frames show
+together: body and masks differ more than in a correct recording, or the cameras do not determine depth. A run asks it
+in each frame with the last frames, and at its end with all of them. What follows from a reason stands in
+:mod:`tk.trackers.reason`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from enum import IntEnum
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -29,11 +30,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.io.results.status import Status
+from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import determine_depth
-from tk.model.masks.image_health import IMAGE_FAULTS, described
+from tk.model.masks.image_health import IMAGE_FAULTS
 from tk.model.stateful import Stateful
-from tk.trackers.residual import LEVEL, LEVEL_SPREAD, OUTLIER, RATE, RECENT, displacement
+from tk.trackers.protocol import Estimate, Tracker, sharing
+from tk.trackers.reason import Reason, is_lost
+from tk.trackers.residual import LEVEL, OUTLIER, RATE, RECENT, displacement, level_spread
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -42,6 +46,9 @@ Bool = NDArray[np.bool_]
 _TINY = 1e-3
 # Sigma is unknown after this many consecutive frames with a high residual, and two failed searches for the person.
 UNKNOWN_AFTER = 6
+# Highest speed of the trunk, m/s: a sprinter reaches 12; and an error of its position between frames, metres.
+FASTEST_M_S, TRUNK_ERROR_M = 12.0, 0.2
+_TRUNK = JOINTS.index("pelvis"), JOINTS.index("neck")
 
 
 class Fault(NamedTuple):
@@ -186,73 +193,54 @@ def _normalised(nats: Float) -> Float:
     return np.asarray(found / found.sum())
 
 
-class Reason(IntEnum):
-    """Why a frame has no pose, is suspect, or has no sigma: the values of `/evidence/reason`. The first one counts."""
-
-    NONE = 0
-    NOBODY = 1
-    UNEXPLAINED = 2
-    NO_NUMBERS = 3
-    JUMPS = 4
-    STILL_HIGH = 5
-    UNCLEAR = 6
-    CONTRADICTED = 7
-    ONE_SIDED = 8
-    HIGH = 9
-    CUT = 10
-
-
 @dataclass(frozen=True)
-class Consequence:
-    """What follows from a reason.
+class Match:
+    """How well a tracker's pose explains a frame, and what is known of the frames before.
 
     Attributes:
-        status: of the frame; None: as the tracker says.
-        sigma: whether sigma is known.
-        meaning: in a few words.
-        text: for the user, with {} for the frames; empty if another line says it.
+        error: the residual, mean over the views; not finite if nobody is seen.
+        most: the residual above which the person is lost.
+        excess: of the residual above its baseline, mean over the views, spreads.
+        cut: whether the person is elsewhere than in the frame before.
+        lost_for, refused: consecutive frames before in which the person was lost, and whose pose was refused, because
+            its residual was still high.
+        high_for: consecutive frames with a high residual, this one included; 0 if it is not high.
+        depth: whether the cameras used determine depth.
+        false_alarm: as for :func:`judge_frames`.
     """
 
-    status: Status | None
-    sigma: bool
-    meaning: str
-    text: str
+    error: float
+    most: float
+    excess: float = 0.0
+    cut: bool = False
+    lost_for: int = 0
+    refused: int = 0
+    high_for: int = 0
+    depth: bool = True
+    false_alarm: float = 0.5
 
+    @property
+    def reason(self) -> Reason:
+        """The reason that the frame itself shows."""
+        if not np.isfinite(self.error):
+            return Reason.NOBODY
+        if self.error > self.most:
+            return Reason.UNEXPLAINED
+        if (self.cut or self.lost_for) and self.excess > self._most_excess:
+            return Reason.STILL_HIGH
+        if not self.depth:
+            return Reason.ONE_SIDED
+        if self.high_for >= UNKNOWN_AFTER:
+            return Reason.HIGH
+        return Reason.CUT if self.cut else Reason.NONE
 
-_IMPOSSIBLE = "the pose found cannot be true: {}: lost, {{}}"
-CONSEQUENCES = {
-    Reason.NONE: Consequence(None, True, "nothing", ""),
-    Reason.NOBODY: Consequence(Status.LOST, False, "too few views", "fewer than two cameras see anybody: no pose, {}"),
-    Reason.UNEXPLAINED: Consequence(Status.LOST, False, "no pose explains the masks", ""),
-    Reason.NO_NUMBERS: Consequence(
-        Status.LOST, False, "joints are no numbers", _IMPOSSIBLE.format("it has joints that are no numbers")
-    ),
-    Reason.JUMPS: Consequence(Status.LOST, False, "the pose jumps", _IMPOSSIBLE.format("it jumps")),
-    Reason.STILL_HIGH: Consequence(
-        Status.LOST, False, "high residual after a loss",
-        _IMPOSSIBLE.format("after a loss its residual is still high"),
-    ),
-    Reason.UNCLEAR: Consequence(Status.SUSPECT, False, "who is who, or which camera is right, is unclear", ""),
-    Reason.CONTRADICTED: Consequence(
-        Status.SUSPECT, False, "body and masks differ",
-        "body and masks differ more than in correct recordings: suspect, {}; likely causes: the calibration of another "
-        "recording, moved cameras, or videos of different recordings (see tk inspect)",
-    ),
-    Reason.ONE_SIDED: Consequence(
-        None, False, "views from one side",
-        "the cameras that are left see the person from the same or from opposite sides: σ is unknown, {}; add a camera "
-        "from another side, at 30 to 150°",
-    ),
-    Reason.HIGH: Consequence(
-        None, False, "the residual stays high", "the residual is high, and no better pose was found: σ is unknown, {}"
-    ),
-    Reason.CUT: Consequence(
-        None, True, "elsewhere than before",
-        "the person is elsewhere than in the frame before, as after a cut in the recording: searched for again, {}",
-    ),
-}  # fmt: skip
-#: meaning of each value of `/evidence/reason`
-MEANINGS = tuple(f"{int(reason)}: {CONSEQUENCES[reason].meaning}" for reason in Reason)
+    @property
+    def _most_excess(self) -> float:
+        """The largest excess of a pose after a loss or a cut: one spread, because no prediction supports such a pose.
+        After the frames in which a baseline follows a change, the level itself may have changed: halfway between a high
+        residual and an outlier is then accepted."""
+        high = NormalDist().inv_cdf(1.0 - self.false_alarm)
+        return 1.0 if self.refused < 1 / RATE else (high + OUTLIER) / 2
 
 
 @dataclass(frozen=True)
@@ -260,35 +248,38 @@ class FrameEvidence:
     """What F frames show of a person.
 
     Attributes:
-        found: (F,) the first :class:`Reason` in each frame itself.
+        found: (F,) the :class:`~tk.trackers.reason.Reason` that each frame itself shows.
         posed: (F,) whether the person is present and has a pose.
+        begins: (F,) whether the pose is not that of the frame before, moved on: after a loss or a cut.
         residual: (F, C, 2) missing and surplus area at the poses; NaN for a camera that was not used.
         depth: (F,) whether the cameras used determine depth.
     """
 
     found: NDArray[np.uint8]
     posed: Bool
+    begins: Bool
     residual: Float
     depth: Bool
 
     @classmethod
     def none(cls, cameras: int) -> FrameEvidence:
         """Return the evidence before the first frame."""
-        residual, depth = np.full((RECENT, cameras, 2), np.nan), np.ones(RECENT, np.bool_)
-        return cls(np.zeros(RECENT, np.uint8), depth, residual, depth)
+        residual, yes = np.full((RECENT, cameras, 2), np.nan), np.ones(RECENT, np.bool_)
+        return cls(np.zeros(RECENT, np.uint8), yes, ~yes, residual, yes)
 
-    def then(self, found: Reason, residual: Float, depth: bool) -> FrameEvidence:
-        """Return the evidence of the last frames with a pose when another one follows."""
+    def then(self, found: Reason, begins: bool, residual: Float) -> FrameEvidence:
+        """Return the evidence of the last frames when another one with a pose follows."""
         return FrameEvidence(
             np.append(self.found[1:], np.uint8(found)),
             self.posed,
+            np.append(self.begins[1:], begins),
             np.concatenate([self.residual[1:], residual[None]]),
-            np.append(self.depth[1:], depth),
+            np.append(self.depth[1:], found != Reason.ONE_SIDED),
         )
 
 
 def judge_frames(evidence: FrameEvidence, false_alarm: float, whole: bool = False) -> NDArray[np.uint8]:
-    """Return (F,) the :class:`Reason` of each of F consecutive frames.
+    """Return (F,) the :class:`~tk.trackers.reason.Reason` of each of F consecutive frames.
 
     Args:
         evidence: what the frames show.
@@ -299,9 +290,14 @@ def judge_frames(evidence: FrameEvidence, false_alarm: float, whole: bool = Fals
     """
     found, posed = evidence.found, evidence.posed
     high = found == Reason.HIGH
-    if whole:
-        high = np.array([high[i : i + UNKNOWN_AFTER].any() for i in range(len(high))], np.bool_)
-    contradicted = _contradicted(np.where(posed[:, None, None], evidence.residual, np.nan), false_alarm)
+    contradicted = np.zeros(len(found), np.bool_)
+    residual = np.where(posed[:, None, None], evidence.residual, np.nan)
+    starts = np.flatnonzero(~posed | evidence.begins)
+    for rows in np.split(np.arange(len(found)), starts):  # frames before a loss or a cut show nothing about this pose
+        contradicted[rows] = _contradicted(residual[rows], false_alarm)
+        if whole:
+            of_these = high[rows]
+            high[rows] = [of_these[i : i + UNKNOWN_AFTER].any() for i in range(len(rows))]
     if whole and 2 * np.count_nonzero(posed & evidence.depth & (contradicted | high)) > np.count_nonzero(posed):
         contradicted = posed
     flags = {Reason.CONTRADICTED: contradicted, Reason.ONE_SIDED: ~evidence.depth, Reason.HIGH: high}
@@ -313,7 +309,8 @@ def judge_frames(evidence: FrameEvidence, false_alarm: float, whole: bool = Fals
 
 def _contradicted(residual: Float, false_alarm: float) -> Bool:
     """Return (F,) whether residuals (F, C, 2) of consecutive frames contradict the poses: the frame is among
-    :data:`~tk.trackers.residual.RECENT` ones whose mean displacement is far above that of correct recordings.
+    :data:`~tk.trackers.residual.RECENT` ones, or all if there are fewer, whose mean displacement is far above that of
+    correct recordings.
 
     Half of the logarithm's variance lies between recordings, so all frames of a recording with a high level would count
     as contradicted. The limit is therefore set for the probability ``false_alarm`` squared.
@@ -324,42 +321,10 @@ def _contradicted(residual: Float, false_alarm: float) -> Bool:
     if len(measured):
         window = min(RECENT, len(measured))
         mean = np.convolve(log[measured], np.full(window, 1.0 / window), "valid")
-        limit = np.log(LEVEL) - LEVEL_SPREAD * NormalDist().inv_cdf(false_alarm**2)
+        limit = np.log(LEVEL) - level_spread(window) * NormalDist().inv_cdf(false_alarm**2)
         for first in np.flatnonzero(mean > limit):
             result[measured[first : first + window]] = True
     return result
-
-
-def first_reason(status: str, sigma: Float | None, nobody: bool = False) -> Reason:
-    """Return the reason that a tracker's status and sigma (J,) imply. ``nobody``: whether no camera shows anybody."""
-    if status == "lost":
-        return Reason.NOBODY if nobody else Reason.UNEXPLAINED
-    return Reason.HIGH if sigma is not None and np.isnan(sigma).all() else Reason.NONE
-
-
-def refused(excess: float, since: int, false_alarm: float) -> bool:
-    """Return whether the pose after a loss is refused, because of its residual's excess, mean over the views.
-
-    It may be one spread, because no prediction supports such a pose. After the frames in which a baseline follows a
-    change, the level itself may have changed: halfway between a high residual and an outlier is then accepted.
-
-    Args:
-        excess: see :class:`~tk.trackers.residual.ResidualBaseline`.
-        since: number of poses refused in turn.
-        false_alarm: as for :func:`judge_frames`.
-    """
-    high = NormalDist().inv_cdf(1.0 - false_alarm)
-    return excess > (1.0 if since < 1 / RATE else (high + OUTLIER) / 2)
-
-
-def is_status(reasons: NDArray[np.integer], status: Status) -> Bool:
-    """Return (...) whether reasons (...) give frames this status."""
-    return np.isin(reasons, [reason for reason, then in CONSEQUENCES.items() if then.status == status])
-
-
-def sigma_known(reasons: NDArray[np.integer]) -> Bool:
-    """Return (...) whether sigma is known in frames with these reasons (...)."""
-    return np.isin(reasons, [reason for reason, then in CONSEQUENCES.items() if then.sigma])
 
 
 def depth_known(rig: Rig, joints: Float, residual: Float | None) -> Bool:
@@ -369,14 +334,57 @@ def depth_known(rig: Rig, joints: Float, residual: Float | None) -> Bool:
     return determine_depth(rig.centers, joints.mean(axis=-2), used)
 
 
-def report_frames(
-    frames: Sequence[int] | NDArray[np.int64],
-    reasons: Sequence[int] | NDArray[np.uint8],
-    note: Callable[[str], None],
-) -> None:
-    """Report the frames (F,) of each reason (F,) by one line for the user."""
-    numbers = np.asarray(frames)
-    for reason, then in CONSEQUENCES.items():
-        found = numbers[np.asarray(reasons) == reason]
-        if len(found) and then.text:
-            note(then.text.format(described(int(found[0]), int(found[-1]), len(found))))
+def impossible(joints: Float, before: Float | None, seconds: float) -> Reason:
+    """Return why joints (J, 3), metres, are impossible so many seconds after others; NONE if they are possible."""
+    if not np.isfinite(joints).all():
+        return Reason.NO_NUMBERS
+    if before is None:
+        return Reason.NONE
+    moved = float(np.linalg.norm(joints[_TRUNK, :] - before[_TRUNK, :], axis=1).min())
+    return Reason.JUMPS if moved > FASTEST_M_S * seconds + TRUNK_ERROR_M else Reason.NONE
+
+
+@dataclass(frozen=True)
+class JudgeState:
+    """What the last frames show; the joints (J, 3), metres, of the last frame with a pose, None after a loss, and its
+    number."""
+
+    recent: FrameEvidence
+    joints: Float | None
+    index: int
+
+
+class FrameJudge(Stateful[JudgeState]):
+    """Judges the estimates of consecutive frames.
+
+    Args:
+        tracker: it searches for the person after an impossible pose.
+        cameras: number of cameras.
+        fps: frames per second.
+        false_alarm: as for :func:`judge_frames`.
+    """
+
+    State = JudgeState
+
+    def __init__(self, tracker: Tracker, cameras: int, fps: float, false_alarm: float) -> None:
+        self._tracker, self._cameras, self._fps, self._false_alarm = tracker, cameras, fps, false_alarm
+        self._recent = FrameEvidence.none(cameras)
+        self._joints: Float | None = None
+        self._index = -1
+
+    def judge(self, index: int, estimate: Estimate) -> Estimate:
+        """Return the estimate of a frame with the reason that the frame itself shows, and with the reason that the last
+        frames show."""
+        found, begins = estimate.found, estimate.origin == Status.RECOVERED
+        if not is_lost(found):
+            before = None if begins else self._joints  # the person may be elsewhere, as after a cut
+            found = impossible(estimate.joints, before, max(index - self._index, 1) / self._fps) or found
+            if is_lost(found) and (tracker := sharing(self._tracker)) is not None:
+                tracker.lose()
+        if is_lost(found):
+            self._joints, self._recent = None, FrameEvidence.none(self._cameras)
+            return replace(estimate, found=found, judged=found)
+        self._joints, self._index = estimate.joints, index
+        residual = np.full((self._cameras, 2), np.nan) if estimate.residual is None else estimate.residual
+        self._recent = self._recent.then(found, begins, residual)
+        return replace(estimate, found=found, judged=Reason(judge_frames(self._recent, self._false_alarm)[-1]))

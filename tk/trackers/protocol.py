@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.io.results.status import Status
 from tk.kernels.mask_values import PERSON
+from tk.trackers.reason import Reason, known_sigma, status_of
 
 if TYPE_CHECKING:  # the process that decodes and segments needs no parts of a tracker
     from tk.model.body.cone_body import ConeBody
@@ -62,15 +64,14 @@ class Estimate:
     Attributes:
         pose: (D,) pose vector, radians and metres, in the order of the tracker's ``pose_names``.
         joints: (J, 3) joint centres, metres. Pose and joints are NaN before anybody is tracked.
-        status: "tracked", "initialised", "recovered", "lost", "suspect" (by the camera monitor), or "absent" (by the
-            run: nobody is there).
-        reason: why it is lost, suspect or without sigma: a :class:`~tk.trackers.judgement.Reason`, 0 if it is not.
+        origin: how the tracker came to the pose: TRACKED, INITIALISED or RECOVERED; ABSENT (by the run) if nobody is
+            there.
         objective: the objective's final value; of contour trackers E_S, mean over the views.
         iterations: (S,) optimiser iterations by stage; for ``search`` 1 if limbs were searched, else 0.
         timing: seconds by stage.
         surface: the hull's surface, if the tracker made one.
-        sigma: (J,) m, standard deviation of each joint position along one axis; NaN if unknown, None if the tracker
-            does not report it.
+        deviation: (J,) m, standard deviation of each joint position along one axis, as computed: also where the reason
+            says that it is not known. None if the tracker does not report it.
         residual: (C, 2) missing area (body outside the mask) and surplus area (mask outside the body) by camera, shares
             of the person's pixels, NaN for a camera that was not used; their sum is E_S. None if not measured.
         masks: (C, H, W) uint8, what the tracker took for the person, cleaned; None where that is the observation's, and
@@ -78,6 +79,8 @@ class Estimate:
             cameras left out included; None likewise.
         mask_source: (C,) uint8, as ``Frame.sources``.
         landmarks: (C, L, 3) those of this person among ``Frame.landmarks``; None if there are none.
+        found: the reason that the frame itself shows.
+        judged: the reason by the last frames, too; None before the frame is judged.
         cameras: (C,) uint8, which cameras were left out, and why: indices in :data:`~tk.trackers.judgement.STATES`.
             None before anybody is tracked.
         shift: (C,) by which share of its longer side each image has moved since the first frame; NaN if unknown. None
@@ -88,23 +91,40 @@ class Estimate:
 
     pose: Float
     joints: Float
-    status: str
+    origin: Status
     objective: float
     iterations: NDArray[np.int32]
     timing: Mapping[str, float]
     surface: HullSurface | None = None
-    sigma: Float | None = None
+    deviation: Float | None = None
     residual: Float | None = None
     masks: NDArray[np.uint8] | None = None
     drawn: NDArray[np.bool_] | None = None
     mask_source: NDArray[np.uint8] | None = None
     landmarks: Float | None = None
-    reason: int = 0
+    found: Reason = Reason.NONE
+    judged: Reason | None = None
     cameras: NDArray[np.uint8] | None = None
     shift: Float | None = None
     frame: int = -1
     time: float = 0.0
     person: int = 0
+
+    @property
+    def reason(self) -> Reason:
+        """Why the frame is lost, suspect or without sigma; NONE if it is not."""
+        return self.found if self.judged is None else self.judged
+
+    @property
+    def status(self) -> str:
+        """The name of its status: "tracked", "initialised", "recovered", "lost", "suspect" or "absent"."""
+        return Status(int(status_of(self.origin, self.reason))).name.lower()
+
+    @property
+    def sigma(self) -> Float | None:
+        """(J,) m, standard deviation of each joint position along one axis; NaN if it is not known, None if the tracker
+        does not report it."""
+        return None if self.deviation is None else known_sigma(self.deviation, self.reason)
 
 
 class Tracker(Protocol):

@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.io.results.status import Status
 from tk.kernels.mask_values import PERSON
 from tk.kernels.silhouette import normal_equations
 from tk.model.body.body_fit import STATURE_DEVIATION
@@ -31,7 +32,6 @@ from tk.model.body.joint_sigma import VIEW_M, contour_variance, directions, post
 from tk.model.body.limb_candidates import Limb, turned
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Rig
-from tk.model.cameras.common_view import determine_depth
 from tk.model.cues.landmarks import contradiction
 from tk.model.cues.part_colors import LearnedColors, color_bins
 from tk.model.cues.ray_costs import Evidence
@@ -55,11 +55,12 @@ from tk.trackers.hypotheses import (
     disagreement,
     walking,
 )
-from tk.trackers.judgement import UNKNOWN_AFTER
+from tk.trackers.judgement import Match, depth_known
 from tk.trackers.proposals import exchanged, limbs
 from tk.trackers.proposals import landmarks as of_landmarks
 from tk.trackers.proposals import opposite as of_heading
 from tk.trackers.protocol import Estimate, Frame, Stopwatch
+from tk.trackers.reason import Reason, is_lost
 from tk.trackers.residual import BaselineState, ResidualBaseline, variance_factor
 from tk.trackers.second_pass import STATURE, SecondPass
 
@@ -117,7 +118,8 @@ class RegionState:
         alive: the hypotheses, best first.
         residuals, colors: what has been learned.
         mean_posture, postures: (J, 3) mean directions, of this number of frames.
-        lost_for, high_for: consecutive frames in which the person was lost, and with a high residual.
+        lost_for, refused, high_for: consecutive frames in which the person was lost, whose pose was refused
+            (:class:`~tk.trackers.judgement.Match`), and with a high residual.
         view_m: see :class:`RegionTracker`.
         spread: (J,) variance of the joints' positions along an axis, metres², over the modes of the last limb search.
         fresh: whether no frame has been tracked yet.
@@ -129,6 +131,7 @@ class RegionState:
     mean_posture: Float
     postures: int
     lost_for: int
+    refused: int
     high_for: int
     view_m: float
     spread: Float
@@ -177,7 +180,7 @@ class RegionTracker(ContourTracker[RegionState]):
     def _reset(self) -> None:
         """Forget the residuals and everything that was decided from them."""
         self.residuals = ResidualBaseline(len(self.rig), self.config.false_alarm)
-        self._lost_for = self._high_for = 0
+        self._lost_for = self._refused = self._high_for = 0
 
     def start(self, frames: Sequence[Frame], subject: Subject) -> None:
         self._alive = [Hypothesis(pose, pose, 0.0) for pose in self.find(frames, subject)]
@@ -277,25 +280,37 @@ class RegionTracker(ContourTracker[RegionState]):
         if searched:
             self._spread = limbs.spread(self.body.skeleton, self._best.pose, found)
         watch.lap("search")
-        lost = float(np.nanmean(look.error)) > contours.lost_error
-        lost |= self._lost_for < UNKNOWN_AFTER and self.residuals.jumped(look.residual)
-        self._learn(evidence, look, lost)
-        again = cut or self._lost_for > 0
-        status = "lost" if lost else "initialised" if self._fresh else "recovered" if again else "tracked"
-        self._lost_for = self._lost_for + 1 if lost else 0
+        pose, error = self._best.pose, float(np.nanmean(look.error))
+        reason = Match(
+            error,
+            contours.lost_error,
+            excess=self.residuals.mean_excess(look.error),
+            cut=cut,
+            lost_for=self._lost_for,
+            refused=self._refused,
+            high_for=self._high_for if self.residuals.high(look.error) else 0,
+            depth=bool(depth_known(self.world.rig, self.body.skeleton.joints(pose), look.residual)),
+            false_alarm=config.false_alarm,
+        ).reason
+        if reason != Reason.UNEXPLAINED:
+            self._learn(evidence, look)
+        origin = self._origin(cut)
+        if not is_lost(reason):
+            self._refused = 0
+        elif reason == Reason.STILL_HIGH:
+            self._refused += 1
+        self._lost_for = self._lost_for + 1 if is_lost(reason) else 0
         self._fresh = False
-        pose = self._best.pose
-        sigma = self._sigma(pose, look, pyramid.landmarks)
-        if self._high_for >= UNKNOWN_AFTER and self.residuals.high(look.error):
-            sigma[:] = np.nan
+        deviation = self._sigma(pose, look, pyramid.landmarks)
         watch.lap("check")
         return Estimate(
             **self.pose_fields(pose),
-            status=status,
-            objective=float(np.nanmean(look.error)),
+            origin=origin,
+            found=reason,
+            objective=error,
             iterations=np.array([iterations.sum(), int(searched)], np.int32),
             timing=watch.laps,
-            sigma=sigma,
+            deviation=deviation,
             residual=look.residual,
             masks=pyramid.masks[0],
             drawn=look.label > 0,
@@ -431,10 +446,8 @@ class RegionTracker(ContourTracker[RegionState]):
             return True
         return self._lost_for > 0 if error <= limit else self._lost_for % RECOVER_EVERY == 0
 
-    def _learn(self, evidence: Evidence, look: _Look, lost: bool) -> None:
+    def _learn(self, evidence: Evidence, look: _Look) -> None:
         """Update the baseline of the residual; the colours, too, if E_S is not above the baseline."""
-        if lost:
-            return
         if self.config.colors and evidence.bins is not None and self.residuals.mean_excess(look.error) <= 0:
             self.colors.learn(evidence.bins[evidence.person], look.label[evidence.person])
         self.residuals.learn(look.residual)
@@ -467,7 +480,7 @@ class RegionTracker(ContourTracker[RegionState]):
         self, pose: Float, curvature: Float, prior: Quadratic, label: NDArray[np.uint8], residual: Float
     ) -> Float:
         """Return (..., J) variance of the joints' positions along an axis, metres², from the contours' noise and the
-        directions of the views, scaled by the residual; NaN if the views used do not determine depth.
+        directions of the views, scaled by the residual.
 
         Args:
             pose: (..., D).
@@ -485,9 +498,7 @@ class RegionTracker(ContourTracker[RegionState]):
         shares = contour_shares(body, self.screen, label, joints)
         used = np.isfinite(residual[..., 0])
         views = view_variance(rays, np.where(used[..., None], shares, 0.0), self.view_m)
-        known = determine_depth(self.world.rig.centers, joints.mean(axis=-2), used)
-        factor = np.where(known, variance_factor(residual), np.nan)
-        return np.asarray((noise + views) * factor[..., None])
+        return np.asarray((noise + views) * variance_factor(residual)[..., None])
 
     def second_pass(
         self,
@@ -519,11 +530,12 @@ class RegionTracker(ContourTracker[RegionState]):
             watch.lap(stage)
         return Estimate(
             **self.pose_fields(pose),
-            status="lost",
+            origin=Status.TRACKED,
+            found=Reason.NOBODY,
             objective=np.inf,
             iterations=np.zeros(len(self.stages), np.int32),
             timing=watch.laps,
-            sigma=np.full(len(JOINTS), np.nan),
+            deviation=np.full(len(JOINTS), np.nan),
             residual=np.full((len(frame.masks), 2), np.nan),
         )
 

@@ -23,7 +23,9 @@ from tk.optim.gauss_newton import GaussNewtonSettings
 from tk.settings import Settings, SilhouetteSettings
 from tk.trackers.contour_finder import LINE_SEARCH, SOLVER, blind
 from tk.trackers.contour_tracker import RECOVER_EVERY, ContourTracker
+from tk.trackers.judgement import Match
 from tk.trackers.protocol import Estimate, Frame, Stopwatch
+from tk.trackers.reason import is_lost
 
 Float = NDArray[np.float64]
 
@@ -90,18 +92,18 @@ class SilhouetteTracker(ContourTracker[SilhouetteState]):
         if due and np.isfinite(error):
             pose = self.best(seen, pose, self.anywhere(seen, pose))
             error = float(self.mean_residual(pyramid, pose[None], frame.uncertain)[0])
-        lost = not error <= config.lost_error
-        status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
+        found, origin = Match(error, config.lost_error).reason, self._origin()
         # nobody is visible: the last pose is kept
         pose = pose if np.isfinite(error) else self._pose
         # after a loss the displacement is no motion
         self._previous, self._pose = pose if self._lost_for else self._pose, pose
-        self._lost_for = self._lost_for + 1 if lost else 0
+        self._lost_for = self._lost_for + 1 if is_lost(found) else 0
         self._fresh = False
         watch.lap("check")
         return Estimate(
             **self.pose_fields(pose),
-            status=status,
+            origin=origin,
+            found=found,
             objective=error,
             iterations=settled.iterations,
             timing=watch.laps,

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
+from tk.io.results.status import Status
 from tk.kernels.nearest import SurfaceIndex
 from tk.model.body.anthropometry import AVERAGE_BODY
 from tk.model.body.cone_body import ConeBody
@@ -41,7 +42,9 @@ from tk.optim import schedule
 from tk.optim.smd import MAX_ITERATIONS
 from tk.settings import Settings
 from tk.trackers.contour_finder import ContourFinder
+from tk.trackers.judgement import Match
 from tk.trackers.protocol import Estimate, Frame, Stopwatch
+from tk.trackers.reason import Reason, is_lost
 
 Float = NDArray[np.float64]
 
@@ -190,8 +193,9 @@ class VolumetricTracker(Stateful[VolumetricState]):
             result = self._search_limbs(frame, problem, result)
         fit = problem.fit(result.pose)
         watch.lap("optimise")
-        lost = self._is_lost(fit)
-        status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
+        found = Match(self._outside(fit), LOST_SHARE).reason
+        lost = is_lost(found)
+        origin = Status.INITIALISED if self._fresh else Status.RECOVERED if self._lost_for else Status.TRACKED
         if not lost:
             # (4) the colour models follow (eq. 16)
             patch, colors = self._correspondences(surface, index, fit)
@@ -204,7 +208,8 @@ class VolumetricTracker(Stateful[VolumetricState]):
         return Estimate(
             pose=result.pose,
             joints=self.skin.skeleton.joints(result.pose),
-            status=status,
+            origin=origin,
+            found=found,
             objective=fit.value,
             iterations=result.iterations,
             timing=watch.laps,
@@ -271,10 +276,10 @@ class VolumetricTracker(Stateful[VolumetricState]):
             starts = starts[:1]
         return np.array(starts)
 
-    def _is_lost(self, fit: Fit) -> bool:
-        """Return whether the body, or one of its limbs, has left the hull."""
+    def _outside(self, fit: Fit) -> float:
+        """Return which share of the body, or of one of its limbs, has left the hull, the largest."""
         chain = 1 + CHAIN_OF_SEGMENT[self.skin.segment[fit.frame.even[0]]]
-        return bool((np.bincount(chain, fit.unmatched) > LOST_SHARE * np.bincount(chain)).any())
+        return float((np.bincount(chain, fit.unmatched) / np.maximum(np.bincount(chain), 1)).max())
 
     def _nothing_seen(self, frame: Frame, surface: HullSurface, watch: Stopwatch) -> Estimate:
         """Return the last pose with status "lost": the volume is empty."""
@@ -285,7 +290,8 @@ class VolumetricTracker(Stateful[VolumetricState]):
         return Estimate(
             pose=self._pose,
             joints=self.skin.skeleton.joints(self._pose),
-            status="lost",
+            origin=Status.TRACKED,
+            found=Reason.NOBODY,
             objective=1.0 + self.config.volumetric.coverage_weight,
             iterations=np.zeros(len(self.stages), np.int32),
             timing=watch.laps,

@@ -203,6 +203,9 @@ class Result:
     # (F, C, L, 3) x, y, pixels of the recorded images, and visibility; NaN where no network was asked
     landmarks: NDArray[np.float32] | None = None
     reason: NDArray[np.uint8] | None = None  # (F,) why a frame is lost, suspect or without sigma, see meta.reasons
+    found: NDArray[np.uint8] | None = None  # (F,) the reason that each frame itself shows, as ``reason``
+    origin: NDArray[np.uint8] | None = None  # (F,) the status before the frame is judged
+    deviation: Float | None = None  # (F, J) metres, sigma as computed, also where it is not known
     camera_state: NDArray[np.uint8] | None = None  # (F, C) why a camera was left out, see meta.camera_states; 0: used
     image_shift: NDArray[np.float32] | None = None  # (F, C) how far each image has moved, share of its longer side
     residual: Float | None = None  # (F, C, 2) missing and surplus area, shares of the person's pixels

@@ -64,10 +64,17 @@ class HealthState:
 
 
 class _Look(NamedTuple):
-    """What is seen of a frame, every some pixels: (C, h, w) the images, and the masks; whether images are given."""
+    """What is seen of a frame.
+
+    Attributes:
+        shown, small: (C, h, w) every some pixels of the images, and of the masks.
+        moved: see :class:`ImageHealth`.
+        given: whether there are images.
+    """
 
     shown: NDArray[np.uint8]
     small: NDArray[np.bool_]
+    moved: NDArray[np.float64]
     given: bool
 
 
@@ -110,8 +117,8 @@ class ImageHealth(Stateful[HealthState]):
         given = images.size > 0
         # the green channel suffices
         shown = images[:, step // 2 :: step, step // 2 :: step, 1].copy() if given else small * np.uint8(255)
-        self.moved = self._shift.look(images, masks, doubtful) if given else np.full(C, np.nan)
-        look = _Look(shown, small, given)
+        self.moved = moved = self._shift.look(images, masks, doubtful) if given else np.full(C, np.nan)
+        look = _Look(shown, small, moved, given)
         faulty = {name: measure(self, look) for name, (_, measure) in IMAGE_FAULTS.items()}
         return [next((name for name, cameras in faulty.items() if cameras[c]), None) for c in range(C)]
 
@@ -119,9 +126,9 @@ class ImageHealth(Stateful[HealthState]):
         """Return (C,) cameras whose image has one colour."""
         return look.given & np.asarray(look.shown.reshape(len(look.shown), -1).std(axis=1) < _BLANK_LEVELS)
 
-    def _has_moved(self, _: _Look) -> NDArray[np.bool_]:
+    def _has_moved(self, look: _Look) -> NDArray[np.bool_]:
         """Return (C,) cameras whose image is elsewhere than in the first frame."""
-        return np.asarray(self.moved > MOST_SHIFT)
+        return np.asarray(look.moved > MOST_SHIFT)
 
     def _frozen(self, look: _Look) -> NDArray[np.bool_]:
         """Return (C,) cameras whose image stands still while the others see movement; take the others for
