@@ -316,7 +316,7 @@ def test_person_who_is_tracked_again_by_other_trackers_is_judged_as_in_the_first
     monkeypatch.setattr(finish, "open_observations", lambda *_: nullcontext(Observed()))
     draft, _ = judged(6 * [0.05])
     given = {"pose": np.zeros((6, 5)), "objective": np.zeros(6), "evidence/camera": np.zeros((6, 4), np.uint8)}
-    result: Any = SimpleNamespace(frames=np.arange(6), status=np.zeros(6, np.uint8))
+    result: Any = SimpleNamespace(**{**vars(draft.result), "status": np.zeros(6, np.uint8)})
     draft = replace(draft, result=result, columns=draft.columns | given)
     task: Any = SimpleNamespace(settings=Settings(), setup=SimpleNamespace(rig=rig, fps=15.0))
     finisher = finish._Finisher(task, True, print, lambda _: None, SimpleNamespace(rig=rig))  # type: ignore[arg-type]
@@ -329,9 +329,7 @@ def test_person_who_is_tracked_again_by_other_trackers_is_judged_as_in_the_first
 def test_cameras_from_opposite_sides_leave_sigma_unknown_and_are_named_as_the_cause() -> None:
     draft, (note,) = judged(20 * [0.05], blind=3)
     assert np.isnan(draft.columns["joints/sigma"]).all()
-    assert (
-        draft.columns["status"].tolist() == [Status.RECOVERED, *19 * [Status.TRACKED]]
-        and (draft.columns["evidence/sigma"] == 0.01).all()
-    )
+    assert draft.columns["status"].tolist() == [Status.RECOVERED, *19 * [Status.TRACKED]]
+    assert (draft.columns["evidence/sigma"] == 0.01).all()
     assert "from opposite sides" in note and "frames 0 to 19" in note
     assert judged(20 * [0.05], blind=2)[1] == []

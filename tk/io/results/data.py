@@ -314,10 +314,13 @@ class Result:
         names = self.meta.joint_names
         try:
             joints = in_joint_order(self.joints, names)
-            sigma = None if self.sigma is None else in_joint_order(self.sigma, names)
+            sigma, deviation = (
+                None if values is None else in_joint_order(values, names) for values in (self.sigma, self.deviation)
+            )
         except KeyError as error:
             raise ResultError(f"{self.path}: /joints/position has no joint {error.args[0]}; track anew") from None
-        return replace(self, meta=replace(self.meta, joint_names=JOINTS), joints=joints, sigma=sigma)
+        meta = replace(self.meta, joint_names=JOINTS)
+        return replace(self, meta=meta, joints=joints, sigma=sigma, deviation=deviation)
 
     def aligned(self) -> tuple[Result, ...]:
         """Return the results of all people with a row for each frame of anybody; rows of absent people have the status
