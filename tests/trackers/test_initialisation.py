@@ -115,7 +115,7 @@ def test_hypothesis_whose_fitted_body_has_the_lower_cost_is_chosen(monkeypatch) 
         for pose, nats in ((wrong, 20.0), (right, 21.0))
     ]
     monkeypatch.setattr("tk.trackers.contour_finder.find_person", lambda *_: hypotheses)
-    pose = tracker.world.poses_out(tracker.find(frames, Subject(STATURE)))[0]
+    pose = tracker.world.poses_out(tracker.find(frames, Subject(STATURE)))
     assert error(SKELETON.joints(pose)[None], right[None])[0] < 0.02
 
 

@@ -165,7 +165,7 @@ class ContourFinder:
     # --- initialisation (silhouette paper, section 4.6) ---------------------------------------------------------
 
     def find(self, frames: Sequence[Frame], subject: Subject) -> Float:
-        """Return poses (B, D) in the first of the frames, the likeliest first; the body is fitted to all of them.
+        """Return the pose (D,) in the first of the frames; the body is fitted to all of them.
 
         Args:
             frames: consecutive observations, at least one; a whole stride is better.
@@ -202,7 +202,7 @@ class ContourFinder:
             seen = [self.see(blind(f), pyramid=shown) for f, shown in zip(some, silhouettes, strict=True)]
             hypotheses = find_person(self, seen, rough)
         if not self.contours.adapt or subject.body is not None:
-            return np.array([one.poses[0] for one in hypotheses])
+            return np.asarray(hypotheses[0].poses[0])
         return self._adapt(frames, pyramids, hypotheses, average.stature, stature is not None)
 
     @contextmanager
@@ -237,7 +237,7 @@ class ContourFinder:
         stature: float,
         known: bool,
     ) -> Float:
-        """Fit the body to the opening and return the poses (B, D) in its first frame, the likeliest first.
+        """Fit the body to the opening and return the pose (D,) in its first frame.
 
         Of several hypotheses the one is chosen that has the lowest sum of two costs: that with the average body and
         that with the body fitted to it, because a fitted body compensates a part of a wrong trajectory.
@@ -259,9 +259,9 @@ class ContourFinder:
                 costs = np.array(list(map(self._converged_score, frames, pyramids, hypothesis.poses)))
                 cost += float(costs[np.isfinite(costs)].mean())  # infinite in frames without a person
             found.append((cost, body, fitted[0]))
-        found.sort(key=lambda one: one[0])
-        self.take_body(found[0][1])
-        return np.array([pose for _, _, pose in found])
+        _, body, pose = min(found, key=lambda one: one[0])
+        self.take_body(body)
+        return np.asarray(pose)
 
     def _converged_score(self, frame: Frame, pyramid: Pyramid, pose: Float) -> float:
         """Return the cost of the pose that a pose (D,) converges to, nats; uncertain pixels count half."""

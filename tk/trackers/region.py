@@ -179,7 +179,8 @@ class RegionTracker(ContourTracker[RegionState]):
         self._lost_for = self._high_for = 0
 
     def start(self, frames: Sequence[Frame], subject: Subject) -> None:
-        self._alive = [Hypothesis(pose, pose, 0.0) for pose in self.find(frames, subject)]
+        pose = self.find(frames, subject)
+        self._alive = [Hypothesis(pose, pose, 0.0)]
         self._mean_posture, self._postures = np.zeros((len(JOINTS), 3)), 0
         self._fresh = True
         self._reset()
