@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
 from typing import Any
 
 import numpy as np
@@ -22,14 +24,15 @@ from tk.model.body.body_fit import INFORMATIVE_FRAMES, STATURE_DEVIATION, Fitted
 from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.initial_pose import rough_pose
 from tk.model.body.limb_candidates import Limb, limbs_of
-from tk.model.body.skeleton import build_skeleton, convert_poses
+from tk.model.body.skeleton import JOINTS, build_skeleton, convert_poses
 from tk.model.body.stored_body import body_values
 from tk.model.cameras.bundle import CORRELATION_PX
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import spread_out
 from tk.model.cameras.landmark_agreement import consensus
 from tk.model.cameras.tracker_frame import TrackerFrame
-from tk.model.cues.landmarks import WEIGHT, LandmarkCue, of_person, propose
+from tk.model.cues.cue import Cue
+from tk.model.cues.landmarks import LandmarkCue, of_person, propose
 from tk.model.cues.part_colors import PartColors, RenderedBody
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Pyramid, Views
@@ -162,7 +165,7 @@ class ContourFinder:
     # --- initialisation (silhouette paper, section 4.6) ---------------------------------------------------------
 
     def find(self, frames: Sequence[Frame], subject: Subject) -> Float:
-        """Return poses (B, D) in the first of the frames, the likeliest first; the body is fitted to all of them.
+        """Return the pose (D,) in the first of the frames; the body is fitted to all of them.
 
         Args:
             frames: consecutive observations, at least one; a whole stride is better.
@@ -199,7 +202,7 @@ class ContourFinder:
             seen = [self.see(blind(f), pyramid=shown) for f, shown in zip(some, silhouettes, strict=True)]
             hypotheses = find_person(self, seen, rough)
         if not self.contours.adapt or subject.body is not None:
-            return np.array([one.poses[0] for one in hypotheses])
+            return np.asarray(hypotheses[0].poses[0])
         return self._adapt(frames, pyramids, hypotheses, average.stature, stature is not None)
 
     @contextmanager
@@ -234,7 +237,7 @@ class ContourFinder:
         stature: float,
         known: bool,
     ) -> Float:
-        """Fit the body to the opening and return the poses (B, D) in its first frame, the likeliest first.
+        """Fit the body to the opening and return the pose (D,) in its first frame.
 
         Of several hypotheses the one is chosen that has the lowest sum of two costs: that with the average body and
         that with the body fitted to it, because a fitted body compensates a part of a wrong trajectory.
@@ -256,9 +259,9 @@ class ContourFinder:
                 costs = np.array(list(map(self._converged_score, frames, pyramids, hypothesis.poses)))
                 cost += float(costs[np.isfinite(costs)].mean())  # infinite in frames without a person
             found.append((cost, body, fitted[0]))
-        found.sort(key=lambda one: one[0])
-        self.take_body(found[0][1])
-        return np.array([pose for _, _, pose in found])
+        _, body, pose = min(found, key=lambda one: one[0])
+        self.take_body(body)
+        return np.asarray(pose)
 
     def _converged_score(self, frame: Frame, pyramid: Pyramid, pose: Float) -> float:
         """Return the cost of the pose that a pose (D,) converges to, nats; uncertain pixels count half."""
@@ -294,9 +297,14 @@ class ContourFinder:
         met = self.choice.render(body, poses[:1])
         return RenderedBody(met.label[0], met.depth[0])
 
-    def landmarks(self, pyramid: Pyramid) -> LandmarkCue | None:
-        """Return the landmarks of the person in a frame as a cue, if there are any."""
-        return None if pyramid.landmarks is None else LandmarkCue(self.views.rig, self.body, pyramid.landmarks)
+    def cues(self, pyramid: Pyramid) -> list[Cue]:
+        """Return what a frame, or each of B frames, shows beside silhouettes: a further cue is listed here."""
+        marked = pyramid.landmarks
+        return [] if marked is None else [LandmarkCue(self.views.rig, self.body, marked)]
+
+    def contradiction(self, pyramid: Pyramid, poses: Float) -> Float:
+        """Return (B, J) variance of the joints' positions, metres², by which the cues contradict poses (B, D)."""
+        return sum((cue.variance(poses) for cue in self.cues(pyramid)), np.zeros((len(poses), len(JOINTS))))
 
     def settle(
         self,
@@ -337,21 +345,20 @@ class ContourFinder:
 
     def terms(self, pyramid: Pyramid, prior: Quadratic | None = None) -> Callable[[Float], Quadratic] | None:
         """Return the terms of the cost beside the contours, about poses (B, D); None if there are none."""
-        landmarks = self.landmarks(pyramid)
-        if landmarks is None:
-            return None if prior is None else lambda _: prior
+        cues = self.cues(pyramid)
+        if not cues and prior is None:
+            return None
 
-        def both(poses: Float) -> Quadratic:
-            seen = landmarks.normal(poses).scaled(WEIGHT / INFORMATION)
-            return seen if prior is None else seen + prior
+        def all_of(poses: Float) -> Quadratic:
+            terms = [cue.normal(poses).scaled(cue.weight / INFORMATION) for cue in cues]
+            return reduce(add, terms if prior is None else [*terms, prior])
 
-        return both
+        return all_of
 
     def evidence(self, grid: RayGrid, frame: Frame, pyramid: Pyramid) -> Evidence:
-        """Return the costs of a frame on a grid of rays, and by its landmarks."""
-        landmarks = self.landmarks(pyramid)
+        """Return the costs of a frame on a grid of rays, and by its cues."""
         colors = self.colors if frame.images.size else None
-        return Evidence.of(grid, pyramid.masks[0], frame.uncertain, frame.images, colors, landmarks)
+        return Evidence.of(grid, pyramid.masks[0], frame.uncertain, frame.images, colors, self.cues(pyramid))
 
     def see(self, frame: Frame, images: NDArray[np.uint8] | None = None, pyramid: Pyramid | None = None) -> Seen:
         """Return what a frame shows; ``images`` as in :meth:`settle`, ``pyramid`` that of the frame, if known."""
@@ -360,7 +367,7 @@ class ContourFinder:
 
     def score(self, pyramid: Pyramid, poses: Float, uncertain: NDArray[np.bool_] | None = None) -> Float:
         """Return (B,) the negative logarithm of the likelihood of a frame without colours, nats."""
-        evidence = Evidence.of(self.screen, pyramid.masks[0], uncertain, landmarks=self.landmarks(pyramid))
+        evidence = Evidence.of(self.screen, pyramid.masks[0], uncertain, cues=self.cues(pyramid))
         return evidence.score(self.body, poses)
 
     def mean_residual(self, pyramid: Pyramid, poses: Float, uncertain: NDArray[np.bool_] | None = None) -> Float:

@@ -32,7 +32,6 @@ from tk.model.body.joint_sigma import VIEW_M, contour_variance, directions, post
 from tk.model.body.limb_candidates import Limb, turned
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Rig
-from tk.model.cues.landmarks import contradiction
 from tk.model.cues.part_colors import LearnedColors, color_bins
 from tk.model.cues.ray_costs import Evidence
 from tk.model.cues.visible_contours import contour_shares
@@ -183,7 +182,8 @@ class RegionTracker(ContourTracker[RegionState]):
         self._lost_for = self._refused = self._high_for = 0
 
     def start(self, frames: Sequence[Frame], subject: Subject) -> None:
-        self._alive = [Hypothesis(pose, pose, 0.0) for pose in self.find(frames, subject)]
+        pose = self.find(frames, subject)
+        self._alive = [Hypothesis(pose, pose, 0.0)]
         self._mean_posture, self._postures = np.zeros((len(JOINTS), 3)), 0
         self._fresh = True
         self._reset()
@@ -301,7 +301,7 @@ class RegionTracker(ContourTracker[RegionState]):
             self._refused += 1
         self._lost_for = self._lost_for + 1 if is_lost(reason) else 0
         self._fresh = False
-        deviation = self._sigma(pose, look, pyramid.landmarks)
+        deviation = self._sigma(pose, look, pyramid)
         watch.lap("check")
         return Estimate(
             **self.pose_fields(pose),
@@ -460,17 +460,16 @@ class RegionTracker(ContourTracker[RegionState]):
         here = normal_equations(self.body.arrays, self.views.at(seen.pyramid, 0), best, self.line_search, regions)
         return _Look(met.label[0], here.hessian[0], seen.evidence.residual(met.label[0]))
 
-    def _sigma(self, pose: Float, look: _Look, landmarks: Float | None) -> Float:
+    def _sigma(self, pose: Float, look: _Look, pyramid: Pyramid) -> Float:
         """Return (J,) one standard deviation of each joint's position along an axis, metres: from the evidence of this
-        frame, the difference to the mean posture until now, what its landmarks contradict, the modes of the limbs, and
+        frame, the difference to the mean posture until now, what its cues contradict, the modes of the limbs, and
         the spread of the hypotheses."""
         skeleton = self.body.skeleton
         variance = self.variance(pose, look.curvature, self.prior(pose), look.label, look.residual)
         self._postures = min(self._postures + 1, _POSTURE_FRAMES)
         self._mean_posture += (directions(skeleton, pose) - self._mean_posture) / self._postures
         variance += posture_variance(skeleton, pose, self._mean_posture) + self._spread
-        if landmarks is not None:
-            variance += contradiction(self.views.rig, self.body, pose, landmarks)
+        variance += self.contradiction(pyramid, pose[None])[0]
         if len(self._alive) > 1:
             poses, cost = (np.array(column) for column in zip(*((h.pose, h.cost) for h in self._alive), strict=True))
             variance += disagreement(skeleton, poses, cost)

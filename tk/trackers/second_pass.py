@@ -29,7 +29,6 @@ from tk.model.body.body_fit import STATURE_DEVIATION
 from tk.model.body.joint_sigma import directions, posture_variance
 from tk.model.body.limb_candidates import Limb, exchanged
 from tk.model.body.skeleton import JOINTS
-from tk.model.cues.landmarks import contradiction
 from tk.model.cues.ray_costs import residual_of
 from tk.model.masks.silhouettes import Pyramid
 from tk.trackers.hypotheses import DROPPED, RENEWAL, SAME_POSE_M
@@ -141,10 +140,7 @@ class SecondPass:
             residual = residual_of(label > 0, sampled >= PERSON, sampled == OTHERS)
             self.residual[chunk] = residual
             variance = tracker.variance(settled.states, settled.hessian, prior, label, residual)
-            if seen.landmarks is not None:
-                for own, pose, landmarks in zip(variance, settled.states, seen.landmarks, strict=True):
-                    own += contradiction(tracker.views.rig, tracker.body, pose, landmarks)
-            self._variance[0, chunk] = variance
+            self._variance[0, chunk] = variance + tracker.contradiction(seen, settled.states)
             self._advance(len(chunk))
 
     def decide(self) -> None:

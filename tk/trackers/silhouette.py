@@ -70,7 +70,7 @@ class SilhouetteTracker(ContourTracker[SilhouetteState]):
         self._fresh = True
 
     def start(self, frames: Sequence[Frame], subject: Subject) -> None:
-        self._pose = self._previous = self.find([blind(f) for f in frames], subject)[0]
+        self._pose = self._previous = self.find([blind(f) for f in frames], subject)
         self._lost_for = 0
         self._fresh = True
 

@@ -20,7 +20,6 @@ from tk.model.cues.landmarks import (
     OFFSET_M,
     SEEN_M,
     LandmarkCue,
-    contradiction,
     of_person,
     propose,
 )
@@ -181,16 +180,16 @@ def test_landmarks_of_a_seated_person_propose_a_seated_pose() -> None:
 
 
 def test_contradicted_joints_get_variance_and_others_none() -> None:
-    assert contradiction(RIG, BODY, POSE, NOISY).max() < 0.03**2
+    assert LandmarkCue(RIG, BODY, NOISY).variance(POSE[None])[0].max() < 0.03**2
     raised = POSE.copy()
     raised[NAMES.index("elbow_l_flexion")] += 2.0
-    variance = contradiction(RIG, BODY, raised, NOISY)
+    variance = LandmarkCue(RIG, BODY, NOISY).variance(raised[None])[0]
     assert variance.shape == (len(JOINTS),)
     wrist = JOINTS.index("wrist_l")
     off = np.linalg.norm(BODY.skeleton.joints(raised)[wrist] - BODY.skeleton.joints(POSE)[wrist])
     assert 0.2 * off < np.sqrt(3 * variance[wrist]) < off
     assert np.delete(variance, wrist).max() < 0.03**2
-    assert not contradiction(RIG, BODY, raised, np.full(SEEN.shape, np.nan)).any()
+    assert not LandmarkCue(RIG, BODY, np.full(SEEN.shape, np.nan)).variance(raised[None]).any()
 
 
 # --- whose landmarks they are -------------------------------------------------------------------------------------

@@ -62,6 +62,10 @@ _OTHER_SIDE = {"_l": "_r", "_r": "_l", "": ""}
 _PARTNER = np.array([LANDMARKS.index(n.removesuffix(side_of(n)) + _OTHER_SIDE[side_of(n)]) for n in LANDMARKS])
 _LOWER = np.array([name[:-2] in ("hip", "knee", "ankle", "heel", "toe") for name in LANDMARKS])
 _HALVES = np.stack([~_LOWER, _LOWER]).astype(np.float64)  # (2, L)
+# The landmarks that show each joint.
+_FACE = tuple(name for name in LANDMARKS if POINTS[name].segment == "head")
+_MIDDLE = {"pelvis": HIPS, "neck": SHOULDERS, "head_top": _FACE}
+_MARKED = {joint: [LANDMARKS.index(name) for name in _MIDDLE.get(joint, (joint,))] for joint in JOINTS}
 
 
 class _Likelihood(NamedTuple):
@@ -89,7 +93,7 @@ class LandmarkRows(NamedTuple):
 
 
 class LandmarkCue:
-    """The landmarks of one person in the V images of a frame, or of F frames.
+    """The landmarks of one person in the V images of a frame, or of F frames: a :class:`~tk.model.cues.cue.Cue`.
 
     Args:
         rig: the cameras.
@@ -98,12 +102,14 @@ class LandmarkCue:
         widened: factor of the landmarks' standard deviations. If it exceeds 1, all images show the person.
     """
 
+    weight = WEIGHT
+
     def __init__(self, rig: Rig, body: ConeBody, seen: Float, widened: float = 1.0) -> None:
         self._rig, self._skeleton, self._seen = rig, body.skeleton, seen
         self._elsewhere = float(np.log(ELSEWHERE)) if widened == 1.0 else -np.inf
         seen = _normalised(rig, seen)
         self._place = places(body.dimensions) @ body.skeleton.T_world_body.T
-        size = body.dimensions.stature / AVERAGE_STATURE_M
+        self._size = size = body.dimensions.stature / AVERAGE_STATURE_M
         known = np.asarray(np.isfinite(seen).all(axis=-1))
         visibility = np.where(known, seen[..., 2], 0.0)
         self._sigma = widened * SEEN_M * size * HIDDEN ** (1.0 - visibility)  # (..., V, L)
@@ -137,6 +143,22 @@ class LandmarkCue:
     def score(self, poses: Float) -> Float:
         """Return (B,) the negative logarithm of the likelihood at poses (B, D), nats, up to a constant of the frame."""
         return self._likelihood(self._skeleton.points(poses, SEGMENT, self._place)).score
+
+    def variance(self, poses: Float) -> Float:
+        """Return (B, J) variance of the joints' positions along an axis, metres², from the distances between poses
+        (B, D) and the triangulated landmarks, beyond the landmarks' own errors.
+
+        Pose or landmark may be right, so half of the squared distance counts. Neck and pelvis have the mean of
+        shoulders and hips, the crown that of the face.
+        """
+        x = self._skeleton.points(poses, SEGMENT, self._place)
+        each = np.broadcast_to(self._seen, (len(poses), *self._seen.shape[-3:]))
+        square = ((x - [triangulate_joints(self._rig, one)[0] for one in each]) ** 2).sum(axis=-1)
+        known = np.isfinite(each).all(axis=-1)
+        visibility = np.where(known, each[..., 2], 0.0).sum(axis=-2) / np.maximum(known.sum(axis=-2), 1)
+        expected = 3 * (deviation(visibility) * self._size) ** 2
+        excess = right_share(visibility) * np.maximum(np.where(np.isfinite(square), square, 0.0) - expected, 0.0) / 6
+        return np.stack([excess[:, rows].mean(axis=1) for rows in _MARKED.values()], axis=1)
 
     def _likelihood(self, x: Float) -> _Likelihood:
         rotation, translation = self._cameras
@@ -224,32 +246,6 @@ def _normalised(rig: Rig, landmarks: Float) -> Float:
             seen = landmarks[..., c, :, :][known]
             result[..., c, :, :][known] = np.column_stack([camera.undistort(seen[:, :2]), seen[:, 2]])
     return result
-
-
-def contradiction(rig: Rig, body: ConeBody, pose: Float, seen: Float) -> Float:
-    """Return (J,) variance of the joints' positions along an axis, metres², from the distances between a pose (D,) and
-    the triangulated landmarks (V, L, 3), beyond the landmarks' own errors.
-
-    Pose or landmark may be right, so half of the squared distance counts. Neck and pelvis have the mean of shoulders
-    and hips, the crown that of the face.
-    """
-    points, _ = triangulate_joints(rig, seen)
-    size = body.dimensions.stature / AVERAGE_STATURE_M
-    known = np.isfinite(seen).all(axis=-1)
-    visibility = np.where(known, seen[..., 2], 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-    expected = 3 * (np.hypot(OFFSET_M, SEEN_M) * size * HIDDEN ** (1.0 - visibility)) ** 2
-    place = places(body.dimensions) @ body.skeleton.T_world_body.T
-    square = ((body.skeleton.points(pose, SEGMENT, place) - points) ** 2).sum(axis=-1)
-    right = right_share(visibility)
-    excess = np.where(np.isfinite(square), right * np.maximum(square - expected, 0.0) / 6, 0.0)
-    by_name = dict(zip(LANDMARKS, excess.tolist(), strict=True))
-
-    def of(names: tuple[str, ...]) -> float:
-        return float(np.mean([by_name[name] for name in names]))
-
-    face = tuple(name for name in LANDMARKS if POINTS[name].segment == "head")
-    middle = {"pelvis": HIPS, "neck": SHOULDERS, "head_top": face}
-    return np.array([by_name[joint] if joint in by_name else of(middle[joint]) for joint in JOINTS])
 
 
 def propose(rig: Rig, body: ConeBody, seen: Float, p_near: Float) -> Float:

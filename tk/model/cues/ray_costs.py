@@ -8,6 +8,7 @@ Costs are shares of the person's rays, averaged over the views: without colours 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,7 +20,7 @@ from tk.kernels.projection import pack_cameras
 from tk.kernels.raycast import Cast, Rays, cast, costs
 from tk.model.body.cone_body import COLOR_GROUPS, ConeBody
 from tk.model.cameras.camera import Rig
-from tk.model.cues.landmarks import LandmarkCue
+from tk.model.cues.cue import Cue
 from tk.model.cues.part_colors import PartColors, color_bins
 
 Float = NDArray[np.float64]
@@ -87,7 +88,7 @@ class Evidence:
         others: (V, h, w) bool, pixels of other people, where a body costs nothing; None if there are none.
         cost: (V, h, w, G + 1) float32, see :mod:`tk.kernels.raycast`.
         bins: (V, h, w) bin of each ray's colour; None without colours.
-        landmarks: the person's landmarks in the frame; None without any.
+        cues: what else was measured of the person in the frame.
     """
 
     grid: RayGrid
@@ -95,7 +96,7 @@ class Evidence:
     cost: NDArray[np.float32]
     bins: NDArray[np.int32] | None
     others: NDArray[np.bool_] | None = None
-    landmarks: LandmarkCue | None = None
+    cues: Sequence[Cue] = ()
 
     @staticmethod
     def of(
@@ -104,10 +105,10 @@ class Evidence:
         uncertain: NDArray[np.bool_] | None = None,
         images: NDArray[np.uint8] | None = None,
         colors: PartColors | None = None,
-        landmarks: LandmarkCue | None = None,
+        cues: Sequence[Cue] = (),
     ) -> Evidence:
         """Return the costs from masks (V, H, W), uncertain pixels, images, the learned colours of the parts, and
-        landmarks."""
+        other cues."""
         sampled = grid.sample(masks)
         person, others = sampled >= PERSON, sampled == OTHERS
         outside = np.ones(person.shape, np.float32)
@@ -122,7 +123,7 @@ class Evidence:
         bins = None if images is None or images.size == 0 else color_bins(grid.sample(images))
         if bins is not None and colors is not None and colors.known:
             cost[person, 1:] = COLOR_COST * colors.mismatch[bins[person]]
-        return Evidence(grid, person, cost, bins, others if shared else None, landmarks)
+        return Evidence(grid, person, cost, bins, others if shared else None, cues)
 
     def costs(
         self,
@@ -154,7 +155,7 @@ class Evidence:
     def nats(self, cost: Float, poses: Float) -> Float:
         """Return :meth:`score` of poses (B, D) whose rays have :meth:`costs` (B,)."""
         views = max(int(np.count_nonzero(self._seen)), 1)
-        return np.asarray(VIEW_NATS * views * cost + (0.0 if self.landmarks is None else self.landmarks.score(poses)))
+        return np.asarray(VIEW_NATS * views * cost + sum(cue.score(poses) for cue in self.cues))
 
     def cast(self, body: ConeBody, poses: Float, drawn: NDArray[np.int32] | None = None) -> tuple[Float, Cast]:
         """Return the cost (B,) of the rays, mean over the views that see anybody, inf if none does; and the parts that
