@@ -17,7 +17,7 @@ from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.reader import read_joints, read_result
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.joints import ROWS
+from tk.model.body.joints import BODIES
 from tk.model.body.skeleton import JOINTS, Skeleton, skeleton_of_names
 from tk.trackers.bodies import body_and_poses
 
@@ -132,7 +132,7 @@ def without_columns(path: Path, names: tuple[str, ...]) -> Path:
 
 
 def test_result_of_the_papers_body_is_drawn_with_straight_waist_and_ankles(three_views: Path, tmp_path: Path) -> None:
-    added = tuple(name for row in ROWS.values() if row.added_dofs for name in row.dof_names)
+    added = tuple(name for name in BODIES[0] if name not in BODIES[-1])
     restored = body_and_poses(read_result(without_columns(Path(shutil.copy(three_views, tmp_path / "r.h5")), added)))
     assert restored is not None
     body, poses = restored
