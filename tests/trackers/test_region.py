@@ -93,7 +93,7 @@ def test_estimate_has_all_fields_of_the_contract() -> None:
     tracker = tracker_at(POSES[0])
     tracker.step(observe(MASKS[0]))
     estimate = tracker.step(observe(MASKS[1], 1))
-    assert tracker.pose_names == SKELETON.names and len(tracker.pose_units) == len(estimate.pose) == 31
+    assert tracker.pose_names == SKELETON.names and len(tracker.pose_units) == len(estimate.pose) == 32
     np.testing.assert_allclose(SKELETON.joints(estimate.pose), estimate.joints, atol=1e-9)
     assert set(estimate.timing) == set(tracker.timing_stages) and len(estimate.iterations) == len(tracker.stages)
     assert estimate.residual is not None and estimate.residual.shape == (3, 2)
@@ -524,6 +524,21 @@ def test_landmarks_pull_a_limb_that_silhouettes_do_not_show() -> None:
         pull[name] = tracker.settle(pyramid, start).states[0, NAMES.index("elbow_l_flexion")]
     assert abs(pull["right"] - pose[NAMES.index("elbow_l_flexion")]) < np.radians(6)
     assert pull["other"] > pull["right"] + np.radians(2)
+
+
+def test_landmarks_turn_the_head_and_not_the_trunk() -> None:
+    """The head stays turned in frames without landmarks; if there are none at all, it is straight."""
+    turn, yaw = NAMES.index("neck_roll"), NAMES.index("torso_yaw")
+    pose = POSES[0].copy()
+    pose[turn] = np.radians(45.0)
+    masks = draw_silhouettes(BODY, RIG, pose[None])[0]
+    tracker, blind = tracker_at(POSES[0], masks), tracker_at(POSES[0], masks)
+    found = [tracker.step(replace(observe(masks, i), landmarks=seen_at(pose, 0.01))).pose for i in range(2)]
+    assert found[-1][turn] == pytest.approx(pose[turn], abs=np.radians(8))
+    assert np.cos(found[-1][yaw] - pose[yaw]) > np.cos(np.radians(3))
+    held = [tracker.step(observe(masks, i)).pose[turn] for i in range(2, 4)]
+    np.testing.assert_allclose(held, found[-1][turn], atol=np.radians(3))
+    assert blind.step(observe(masks)).pose[turn] == 0.0
 
 
 def test_landmarks_that_nobody_is_seen_with_change_nothing() -> None:

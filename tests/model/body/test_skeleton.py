@@ -56,8 +56,8 @@ def mirrored(pose, skeleton=SKELETON):
     for k, name in enumerate(skeleton.names):
         partner = name.replace("_l_", "_#_").replace("_r_", "_l_").replace("_#_", "_r_")
         # what moves along y, or turns about an axis in the plane of symmetry, changes its sign
-        sign = -1 if name in ("torso_y", "torso_yaw", "torso_roll", "neck_yaw", "neck_roll", "waist_roll", "waist_yaw") else 1
-        result[skeleton.index(partner)] = sign * pose[k]
+        odd = ("torso_y", "torso_yaw", "torso_roll", "neck_yaw", "neck_roll", "waist_roll", "waist_yaw")
+        result[skeleton.index(partner)] = -pose[k] if name in odd else pose[k]
     return result
 
 
