@@ -590,6 +590,19 @@ def test_second_pass_ignores_landmarks_of_excluded_cameras() -> None:
     np.testing.assert_array_equal(found, same)
 
 
+def test_second_pass_interpolates_the_turn_of_the_head_between_frames_with_landmarks() -> None:
+    turn, first = NAMES.index("neck_roll"), POSES.copy()
+    first[:, turn] = np.radians([0, 0, 0, 30, 30, 30])  # the first pass keeps the last turn
+    landmarks = np.full((6, *seen_at(POSES[0])[0].shape), np.nan)
+    for i in (1, 4):
+        landmarks[i] = seen_at(first[i], 0.01)[0]
+    tracker = tracker_at(POSES[0])
+    poses, _, _ = tracker.second_pass(MASKS, first, np.zeros(6, bool), np.zeros((6, 3, 2)), None, landmarks, True)
+    found = np.degrees(poses[:, turn])
+    np.testing.assert_allclose(found[[1, 4]], [0, 30], atol=8)
+    np.testing.assert_allclose(found[[0, 2, 3, 5]], [0, 10, 20, 30], atol=1e-3)
+
+
 def test_second_pass_corrects_legs_by_landmarks_of_all_cameras() -> None:
     """Legs that are exchanged in all frames: no other frame shows them right."""
     tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=0.1))

@@ -106,6 +106,15 @@ class SecondPass:
         self._variance = np.zeros((2, len(poses), len(JOINTS)))  # of the pose, and of the choice between two
         self._body_variance: Float = np.zeros(len(JOINTS))
         self._done = 0
+        self._interpolate()
+
+    def _interpolate(self) -> None:
+        """Set angles that only landmarks show, in frames without any, between those of the frames with landmarks."""
+        if self._landmarks is None:
+            return
+        seen = self.tracked[np.isfinite(self._landmarks[self.tracked]).any(axis=(1, 2, 3))]
+        for k in np.flatnonzero(self.tracker.body.skeleton.is_by_landmarks) if len(seen) else ():
+            self.poses[self.tracked, k] = np.interp(self.tracked, seen, self.poses[seen, k])
 
     @property
     def sigma(self) -> Float:
