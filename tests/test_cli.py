@@ -38,7 +38,7 @@ def test_track_writes_a_complete_result(tk: Tk, quick: Path, tiny: Path, tmp_pat
     assert {path.name for path in tmp_path.iterdir()} == {"result.h5"}  # --no-report
     found = read_result(result)
     assert (found.meta.capture, found.meta.method, found.meta.seed, found.meta.fps) == ("demo", "region", 5, 15.0)
-    assert found.pose.shape == (6, 31) and found.meta.joint_names == JOINTS and len(found.meta.residual_cameras) == 4
+    assert found.pose.shape == (6, 32) and found.meta.joint_names == JOINTS and len(found.meta.residual_cameras) == 4
     np.testing.assert_array_equal(found.frames, np.arange(2, 8))
     np.testing.assert_allclose(found.time, np.arange(2, 8) / 15.0)
     for name in ("pose", "joints", "sigma", "residual", "objective"):

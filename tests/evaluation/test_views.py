@@ -13,11 +13,12 @@ import pytest
 from tests.conftest import QUICK, Tk, track
 from tests.model.figures import draw_silhouettes
 from tk.evaluation.views import capture_of, evaluate_views
+from tk.export import export
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.reader import read_joints, read_result
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.joints import ROWS
+from tk.model.body.joints import BODIES
 from tk.model.body.skeleton import JOINTS, Skeleton, skeleton_of_names
 from tk.trackers.bodies import body_and_poses
 
@@ -131,12 +132,18 @@ def without_columns(path: Path, names: tuple[str, ...]) -> Path:
     return path
 
 
-def test_result_of_the_papers_body_is_drawn_with_straight_waist_and_ankles(three_views: Path, tmp_path: Path) -> None:
-    added = tuple(name for row in ROWS.values() if row.added_dofs for name in row.dof_names)
-    restored = body_and_poses(read_result(without_columns(Path(shutil.copy(three_views, tmp_path / "r.h5")), added)))
-    assert restored is not None
+@pytest.mark.parametrize("names", BODIES[1:])
+def test_degrees_of_freedom_that_a_file_lacks_are_straight(
+    names: tuple[str, ...], three_views: Path, tmp_path: Path
+) -> None:
+    """Those of the paper's body, and those of files from before the head turned."""
+    lacking = tuple(name for name in BODIES[0] if name not in names)
+    result = read_result(without_columns(Path(shutil.copy(three_views, tmp_path / "r.h5")), lacking))
+    restored = body_and_poses(result)
+    assert restored is not None and result.paper_pose().shape == (len(result), 24)
     body, poses = restored
-    assert not poses[:, body.skeleton.is_straight].any() and poses.any()
+    assert not poses[:, np.isin(body.skeleton.names, lacking)].any() and poses.any()
+    assert export(result.path, ["bvh", "csv"]).files
 
 
 def test_poses_of_another_body_are_refused(tk: Tk, tiny: Path, three_views: Path, tmp_path: Path) -> None:

@@ -24,8 +24,8 @@ Write = Callable[..., Path]
 
 
 def poses(skeleton: Skeleton = SKELETON) -> np.ndarray:
-    """(F, D) smooth, within the limits."""
-    rng = np.random.default_rng(0)
+    """(F, D) smooth, within the limits; no arm is near the singular direction of a MOT file's angles."""
+    rng = np.random.default_rng(3)
     t = np.arange(FRAMES)[:, None] / FPS
     low, high = np.maximum(skeleton.lower, -1.0), np.minimum(skeleton.upper, 1.0)
     count = len(skeleton.names)

@@ -51,7 +51,7 @@ def test_csv_of_points(write: Write) -> None:
 def test_csv_of_angles(write: Write) -> None:
     written = export(write(), ["csv"])
     angles = written.files[1]
-    assert written.notes[-1] == f"{angles}: blank: neck rotation: the body has no degree of freedom for it"
+    assert written.notes[-1] == f"{angles}: blank: neck rotation: only landmarks show it, and none were used"
     assert angles.name == "walk_angles.csv"
     rows = rows_of(angles)
     assert {row["degrees"] for row in rows if (row["joint"], row["angle"]) == ("neck", "rotation")} == {""}

@@ -68,3 +68,5 @@ def test_result_has_the_landmarks_that_were_seen_and_a_resumed_run_equals_an_uni
         np.testing.assert_array_equal(getattr(found, name), getattr(result, name), err_msg=name)
     joints = np.array([BODY.skeleton.joints(pose) for pose in POSES])
     assert np.linalg.norm(result.joints - joints, axis=2).mean() < 0.03
+    assert np.isfinite(result.angles["neck"]).all()
+    assert not any(joint.unmeasured for joint in result.meta.angles)

@@ -24,6 +24,7 @@ from tk.io.captures.frames import FrameSet
 from tk.io.results.data import Result
 from tk.io.results.reader import read_result
 from tk.io.results.status import Status
+from tk.model.body.angles import UNSEEN
 from tk.model.cameras.volume import Volume
 from tk.model.setup import Setup, Subject
 from tk.run import offline
@@ -115,6 +116,10 @@ def test_the_second_pass_needs_no_folder(tmp_path: Path) -> None:
     result = read_result(tmp_path / "r.h5")
     expected = np.array([BODY.skeleton.joints(pose) for pose in POSES])
     assert np.linalg.norm(result.joints - expected, axis=2).mean() < 0.03
+    # no network has seen the face
+    assert not result.pose[:, result.meta.pose_names.index("neck_roll")].any()
+    np.testing.assert_array_equal(np.isnan(result.angles["neck"]), [[False, False, True]] * len(result))
+    assert [joint.unmeasured for joint in result.meta.angles if joint.unmeasured] == [f"rotation: {UNSEEN}"]
 
 
 # --- nobody is there yet ----------------------------------------------------------------------------------------------

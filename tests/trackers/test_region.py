@@ -94,7 +94,7 @@ def test_estimate_has_all_fields_of_the_contract() -> None:
     tracker = tracker_at(POSES[0])
     tracker.step(observe(MASKS[0]))
     estimate = tracker.step(observe(MASKS[1], 1))
-    assert tracker.pose_names == SKELETON.names and len(tracker.pose_units) == len(estimate.pose) == 31
+    assert tracker.pose_names == SKELETON.names and len(tracker.pose_units) == len(estimate.pose) == 32
     np.testing.assert_allclose(SKELETON.joints(estimate.pose), estimate.joints, atol=1e-9)
     assert set(estimate.timing) == set(tracker.timing_stages) and len(estimate.iterations) == len(tracker.stages)
     assert estimate.residual is not None and estimate.residual.shape == (3, 2)
@@ -530,6 +530,21 @@ def test_landmarks_pull_a_limb_that_silhouettes_do_not_show() -> None:
     assert pull["other"] > pull["right"] + np.radians(2)
 
 
+def test_landmarks_turn_the_head_and_not_the_trunk() -> None:
+    """The head stays turned in frames without landmarks; if there are none at all, it is straight."""
+    turn, yaw = NAMES.index("neck_roll"), NAMES.index("torso_yaw")
+    pose = POSES[0].copy()
+    pose[turn] = np.radians(45.0)
+    masks = draw_silhouettes(BODY, RIG, pose[None])[0]
+    tracker, blind = tracker_at(POSES[0], masks), tracker_at(POSES[0], masks)
+    found = [tracker.step(replace(observe(masks, i), landmarks=seen_at(pose, 0.01))).pose for i in range(2)]
+    assert found[-1][turn] == pytest.approx(pose[turn], abs=np.radians(8))
+    assert np.cos(found[-1][yaw] - pose[yaw]) > np.cos(np.radians(3))
+    held = [tracker.step(observe(masks, i)).pose[turn] for i in range(2, 4)]
+    np.testing.assert_allclose(held, found[-1][turn], atol=np.radians(3))
+    assert blind.step(observe(masks)).pose[turn] == 0.0
+
+
 def test_landmarks_that_nobody_is_seen_with_change_nothing() -> None:
     unseen = np.full_like(seen_at(POSES[0]), np.nan)
     elsewhere = POSES[0].copy()
@@ -577,6 +592,19 @@ def test_second_pass_ignores_landmarks_of_excluded_cameras() -> None:
         for landmarks in (spoilt, plain)
     )
     np.testing.assert_array_equal(found, same)
+
+
+def test_second_pass_interpolates_the_turn_of_the_head_between_frames_with_landmarks() -> None:
+    turn, first = NAMES.index("neck_roll"), POSES.copy()
+    first[:, turn] = np.radians([0, 0, 0, 30, 30, 30])  # the first pass keeps the last turn
+    landmarks = np.full((6, *seen_at(POSES[0])[0].shape), np.nan)
+    for i in (1, 4):
+        landmarks[i] = seen_at(first[i], 0.01)[0]
+    tracker = tracker_at(POSES[0])
+    poses, _, _ = tracker.second_pass(MASKS, first, np.zeros(6, bool), np.zeros((6, 3, 2)), None, landmarks, True)
+    found = np.degrees(poses[:, turn])
+    np.testing.assert_allclose(found[[1, 4]], [0, 30], atol=8)
+    np.testing.assert_allclose(found, np.interp(range(6), [1, 4], found[[1, 4]]), atol=1e-9)
 
 
 def test_second_pass_corrects_legs_by_landmarks_of_all_cameras() -> None:

@@ -252,7 +252,7 @@ def test_a_result_of_the_silhouette_tracker_follows_the_contract_and_can_be_exte
     np.testing.assert_array_equal(read_result(parts).pose, result.pose)
     assert result.meta.method == "silhouette" and mean_error(result, tiny) < 0.08
     assert result.status.tolist() == [Status.INITIALISED] + [Status.TRACKED] * 4
-    assert (result.pose.shape, result.iterations.shape) == ((5, 31), (5, 3))
+    assert (result.pose.shape, result.iterations.shape) == ((5, 32), (5, 3))
     assert {"decode", "masks", "masks_clean", "optimise", "check", "total"} <= set(result.timing)
     assert np.shape(result.model["parts/shape"]) == (22, 4)
 

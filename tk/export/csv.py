@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from tk.export.motion import Motion
-from tk.model.body.angles import ANGLES, UNMEASURED, joint_angles
+from tk.model.body.angles import ANGLES, by_reason, joint_angles
 
 
 def write_points_csv(motion: Motion, path: Path) -> None:
@@ -30,8 +30,9 @@ def write_angles_csv(motion: Motion, path: Path) -> str | None:
     Returns:
         A note that names the angles that are blank in every frame.
     """
-    pose_names = motion.result.meta.pose_names
-    degrees = joint_angles(motion.rotations, motion.T_world_body, motion.segments, pose_names)
+    meta = motion.result.meta
+    body = meta.pose_names, bool(meta.landmark_names)
+    degrees = joint_angles(motion.rotations, motion.T_world_body, motion.segments, *body)
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream)
         writer.writerow(("frame", "time", "status", "joint", "angle", "degrees"))
@@ -41,8 +42,8 @@ def write_angles_csv(motion: Motion, path: Path) -> str | None:
                 for name, value in zip(angles.names, degrees[angles.joint][f], strict=True):
                     is_known = motion.known[f] and np.isfinite(value)
                     writer.writerow((*start, angles.joint, name, f"{value:.4f}" if is_known else ""))
-    blank = [f"{angles.joint} {name}" for angles in ANGLES for name in angles.unmeasured(pose_names)]
-    return f"blank: {', '.join(blank)}: {UNMEASURED}" if blank else None
+    blank = {f"{one.joint} {name}": why for one in ANGLES for name, why in one.unmeasured(*body).items()}
+    return f"blank: {by_reason(blank)}" if blank else None
 
 
 def _start(motion: Motion, f: int) -> tuple[str, str, str]:

@@ -14,22 +14,28 @@ NEAREST_M = 0.1
 # The parts that may hide a part are the bits of an int64.
 MOST_PARTS = 64
 # Columns of ``parts``: a, b, h, m of the shape (from 0), the 3×4 frame, CONE or ELLIPSOID, the last degree of freedom
-# above the part, its limb, its colour group.
-PART_FRAME, PART_KIND, PART_DOF, PART_LIMB, PART_GROUP = 4, 16, 17, 18, 19
+# above the part, its limb, its colour group, the last degree of freedom that its contours move.
+PART_FRAME, PART_KIND, PART_DOF, PART_LIMB, PART_GROUP, PART_MOVED = 4, 16, 17, 18, 19, 20
 
 
 class ConeArrays(NamedTuple):
     """A cone body as plain arrays (D degrees of freedom, P parts, Q curves), the first two of one real type."""
 
     tree: NDArray  # (D, 11) of `tk.kernels.kinematics.pack_tree`
-    parts: NDArray  # (P, 20) of `pack_parts`
+    parts: NDArray  # (P, 21) of `pack_parts`
     curves: NDArray[np.int32]  # (Q, 2) int32 part and kind of each curve, see `tk.kernels.cones`
 
 
 def pack_parts(
-    shape: np.ndarray, frame: np.ndarray, kind: np.ndarray, dof: np.ndarray, limb: np.ndarray, group: np.ndarray
+    shape: np.ndarray,
+    frame: np.ndarray,
+    kind: np.ndarray,
+    dof: np.ndarray,
+    limb: np.ndarray,
+    group: np.ndarray,
+    moved: np.ndarray,
 ) -> NDArray:
-    """Pack the parts of a body into one array (P, 20), float64.
+    """Pack the parts of a body into one array (P, 21), float64.
 
     Args:
         shape: (P, 4) a, b, h, m.
@@ -38,8 +44,9 @@ def pack_parts(
         dof: (P,) the last degree of freedom above each part.
         limb: (P,) number of the limb; parts of one limb never make each other's edges ambiguous.
         group: (P,) colour group, from 0.
+        moved: (P,) the last degree of freedom that the part's contours move: ``dof``, or one above it.
     """
-    return np.column_stack([shape, np.reshape(frame, (-1, 12)), kind, dof, limb, group]).astype(np.float64)
+    return np.column_stack([shape, np.reshape(frame, (-1, 12)), kind, dof, limb, group, moved]).astype(np.float64)
 
 
 @ti.func

@@ -114,7 +114,7 @@ def load_corner(outlines: ti.template(), c: int, i: int):
 
 @ti.func
 def trace_curve(
-    parts: ti.template(),  # (P, 20)
+    parts: ti.template(),  # (P, 21)
     placed: ti.template(),  # (B, P, 16)
     cameras: ti.template(),  # (V, 26)
     b: int,
@@ -169,7 +169,7 @@ def distance_sqr(e, a, b):
 
 @ti.func
 def nearest_rival(
-    parts: ti.template(),  # (P, 20)
+    parts: ti.template(),  # (P, 21)
     curves: ti.template(),  # (Q, 2)
     outlines: ti.template(),  # (B V Q, 31)
     first: int,  # row of the view's first curve

@@ -115,7 +115,7 @@ def middle_cost(
 
 @ti.func
 def enclose_part(
-    parts: ti.template(),  # (P, 20)
+    parts: ti.template(),  # (P, 21)
     placed: ti.template(),  # (B, P, 12)
     cameras: ti.template(),  # (V, 26)
     b: int,
@@ -192,7 +192,7 @@ def covered_columns(
 
 @ti.func
 def first_part(
-    parts: ti.template(),  # (P, 20)
+    parts: ti.template(),  # (P, 21)
     placed: ti.template(),  # (B, P, 12)
     outline: ti.template(),  # (B, V, P, _COLUMNS)
     stretch: ti.template(),  # (B, K, 2)
@@ -222,7 +222,7 @@ def _cast_kernel(real):
     def cast_rows(
         # the body
         tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
-        parts: ti.types.ndarray(dtype=real, ndim=2),  # (P, 20)
+        parts: ti.types.ndarray(dtype=real, ndim=2),  # (P, 21)
         drawn: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (K,) the parts to draw
         chain: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,) the degrees of freedom that move them
         # the frame

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.cone_arrays import PART_DOF, PART_LIMB, ConeArrays, group_of, shape_of
+from tk.kernels.cone_arrays import PART_LIMB, PART_MOVED, ConeArrays, group_of, shape_of
 from tk.kernels.cone_contours import (
     LENGTH,
     OUTLINE_NUMBERS,
@@ -261,7 +261,7 @@ def search_contours(
         sums[b, COST] = sums[b, COST] + cost
         sums[b, FOUND] = sums[b, FOUND] + met
         sums[b, ALL] = sums[b, ALL] + all_samples
-        k = ti.cast(parts[p, PART_DOF], ti.i32)
+        k = ti.cast(parts[p, PART_MOVED], ti.i32)
         for a in ti.static(range(INERTIA_NUMBERS)):
             joints[b, k, INERTIA + a] = joints[b, k, INERTIA + a] + inertia[a]
         for a in ti.static(range(PULL_NUMBERS)):
@@ -274,7 +274,7 @@ def _descent_kernel(real):
     def silhouette_descent(
         # the body
         tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
-        parts: ti.types.ndarray(dtype=real, ndim=2),  # (P, 20)
+        parts: ti.types.ndarray(dtype=real, ndim=2),  # (P, 21)
         curves: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (Q, 2)
         # the frame
         cameras: ti.types.ndarray(dtype=real, ndim=2),  # (V, 26)

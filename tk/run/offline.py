@@ -159,9 +159,10 @@ class _Finisher:
         body, poses = tracker.body.standing(setup.up), draft.current("pose")
         # poses of the first pass stay as they are
         kept = () if "pose" in draft.columns else ("pose", "joints/position")
-        columns = draft.columns | {name: v for name, v in _columns(body, poses).items() if name not in kept}
+        seen = bool(draft.result.meta.landmark_names)
+        columns = draft.columns | {name: v for name, v in _columns(body, poses, seen).items() if name not in kept}
         filtered = smooth(body.skeleton, poses, ~draft.lost, setup.fps)
-        smoothed = {**_columns(body, filtered.poses), "bridged": filtered.bridged}
+        smoothed = {**_columns(body, filtered.poses, seen), "bridged": filtered.bridged}
         return Revision(columns, smoothed, model)
 
     def _complete(self, masks: MaskStore, person: int, tracker: TwoPassTracker, result: Result) -> bool:
@@ -391,9 +392,10 @@ def _report(frames: NDArray[np.int64], reasons: NDArray[np.uint8] | None, note: 
         report_frames(frames, reasons, note if alone else lambda line: note(f"person {person}: {line}"))
 
 
-def _columns(body: ConeBody, poses: NDArray[np.float64]) -> dict[str, NDArray[np.floating]]:
-    """Return the datasets of poses (F, D) of a body and of what is derived from them."""
-    derived = derive(body.skeleton, body.dimensions, poses)
+def _columns(body: ConeBody, poses: NDArray[np.float64], landmarks: bool) -> dict[str, NDArray[np.floating]]:
+    """Return the datasets of poses (F, D) of a body, and of what is derived from them; ``landmarks``: whether they were
+    used."""
+    derived = derive(body.skeleton, body.dimensions, poses, landmarks)
     columns: dict[str, NDArray[np.floating]] = {"pose": poses, "joints/position": derived.joints}
     columns["segments/rotation"] = derived.rotations
     columns["feet/position"] = derived.feet

@@ -143,6 +143,7 @@ class Plan:
     def meta(self) -> ResultMeta:
         """Return what the result says about itself."""
         tracker, task, setup = self.tracker, self.task, self.task.setup
+        landmarks = LANDMARKS if tracker.reports_sigma and sees_landmarks(task) else ()
         return ResultMeta(
             pose_names=tracker.pose_names,
             pose_units=tracker.pose_units,
@@ -157,12 +158,12 @@ class Plan:
             sigma=tracker.reports_sigma,
             residual_cameras=setup.rig.names if tracker.reports_sigma else (),
             mask_sources=sources_of_masks(task.source) if tracker.reports_sigma else (),
-            landmark_names=LANDMARKS if tracker.reports_sigma and sees_landmarks(task) else (),
+            landmark_names=landmarks,
             reasons=MEANINGS,
             camera_states=STATE_MEANINGS if tracker.reports_sigma else (),
             segment_names=SEGMENTS if tracker.has_segments else (),
             feet=tracker.has_segments,
-            angles=JointAngles.of_body(tracker.pose_names) if tracker.has_segments else (),
+            angles=JointAngles.of_body(tracker.pose_names, bool(landmarks)) if tracker.has_segments else (),
             objective_kind=tracker.objective_kind,
         )
 

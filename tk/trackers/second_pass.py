@@ -163,6 +163,17 @@ class SecondPass:
                 self._variance[1, frames] += (share * (1.0 - share))[:, None] * apart
                 self.poses[frames[share > 0.5]] = other[frames[share > 0.5]]
         self.optimise(np.flatnonzero((self.poses != before).any(axis=1)))
+        self._interpolate()
+
+    def _interpolate(self) -> None:
+        """Set angles that only landmarks show between those of the frames in which two images or more have landmarks:
+        neither joints nor contours depend on them."""
+        if self._landmarks is None:
+            return
+        images = np.isfinite(self._landmarks[self.tracked]).any(axis=(2, 3)).sum(axis=1)
+        seen = self.tracked[images > 1]
+        for k in np.flatnonzero(self.tracker.body.skeleton.is_by_landmarks) if len(seen) else ():
+            self.poses[self.tracked, k] = np.interp(self.tracked, seen, self.poses[seen, k])
 
     def _track(self, alternatives: Sequence[Alternative], step: int) -> tuple[Float, Float]:
         """Track A alternatives forwards (``step`` 1) or backwards (-1).

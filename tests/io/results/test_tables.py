@@ -36,7 +36,7 @@ def test_table_has_one_row_per_frame_and_all_values_of_the_file(result: Result) 
 def test_xarray_dataset_has_named_dimensions(result: Result) -> None:
     pytest.importorskip("xarray")
     data = result.to_xarray()
-    assert data.sizes["frame"] == 3 and data.sizes["dof"] == 31
+    assert data.sizes["frame"] == 3 and data.sizes["dof"] == 32
     np.testing.assert_array_equal(
         data["joints"].sel(joint="knee_r", axis="z"),
         result.joints[:, result.meta.joint_names.index("knee_r"), 2],

@@ -214,7 +214,7 @@ def test_suspect_frames_have_a_pose_and_absent_frames_have_none(path: Path) -> N
 
 def test_paper_pose_is_derived_from_the_names_of_the_pose(path: Path) -> None:
     skeleton = build_skeleton(BodyDimensions.from_stature(1.7))
-    pose = skeleton.clip(np.linspace(-0.3, 0.3, 31))
+    pose = skeleton.clip(np.linspace(-0.3, 0.3, len(skeleton.names)))
     with ResultWriter.create(path, replace(META, pose_names=skeleton.names, pose_units=skeleton.units)) as writer:
         writer.append({0: make_frame(0) | {"pose": pose}})
     np.testing.assert_array_equal(read_result(path).paper_pose(), [paper_poses(skeleton, pose)])

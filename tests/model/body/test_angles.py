@@ -7,11 +7,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tk.model.body.angles import ANGLES, FORWARD_UP_RIGHT, MIRROR, joint_angles, standing_axes, standing_rotations
+from tk.model.body.angles import (
+    ANGLES,
+    FORWARD_UP_RIGHT,
+    MIRROR,
+    UNMEASURED,
+    UNSEEN,
+    by_reason,
+    joint_angles,
+    standing_axes,
+    standing_rotations,
+)
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.gait_poses import neutral_pose
+from tk.model.body.joints import BODIES
 from tk.model.body.rotations import compose
-from tk.model.body.skeleton import JOINTS, SEGMENTS, Skeleton, build_skeleton, shoulder_angles
+from tk.model.body.skeleton import JOINTS, SEGMENTS, Skeleton, build_skeleton, shoulder_angles, skeleton_of_names
 
 BODY = BodyDimensions.from_stature(1.75)
 SKELETON = build_skeleton(BODY)
@@ -73,6 +84,7 @@ KNOWN = [
     ({"waist_pitch": 15.0}, "lumbar", "flexion", 15.0),
     ({"neck_pitch": 20.0}, "neck", "flexion", 20.0),
     ({"neck_yaw": 12.0}, "neck", "lateral_bending", 12.0),
+    ({"neck_roll": 40.0}, "neck", "rotation", 40.0),
     ({"waist_yaw": -10.0}, "lumbar", "rotation", 10.0),
     ({"torso_pitch": 8.0}, "pelvis", "tilt", 8.0),
     ({"torso_roll": 5.0}, "pelvis", "obliquity", 5.0),
@@ -209,22 +221,32 @@ def test_feet_that_ride_on_the_shins_have_no_angle() -> None:
     np.testing.assert_array_equal(found["ankle_l"], [[np.nan, np.nan]])
 
 
-@pytest.mark.parametrize("paper", [False, True])
-def test_angle_without_a_degree_of_freedom_is_nan(paper: bool) -> None:
+@pytest.mark.parametrize("names", BODIES)
+def test_angle_without_a_degree_of_freedom_is_nan(names: tuple[str, ...]) -> None:
     """An angle is a number if and only if it differs between poses."""
-    skeleton = build_skeleton(BODY, paper=paper)
+    skeleton = skeleton_of_names(names, BODY, "z")
+    paper = names == BODIES[-1]
     low, high = np.maximum(skeleton.lower, -1.0), np.minimum(skeleton.upper, 1.0)
     R = segment_rotations(skeleton, np.random.default_rng(0).uniform(low, high, (9, len(low))))
-    missing = [(a.joint, *a.unmeasured(skeleton.names)) for a in ANGLES if a.unmeasured(skeleton.names)]
+    missing = [(a.joint, *a.unmeasured(names)) for a in ANGLES if a.unmeasured(names)]
     bent = [("lumbar", "flexion", "lateral_bending", "rotation")] * paper
     ankles = [(f"ankle_{side}", "dorsiflexion", "inversion") for side in "lr"] * paper
-    assert sorted(missing) == sorted([*bent, ("neck", "rotation"), *ankles])
+    assert sorted(missing) == sorted([*bent, *[("neck", "rotation")] * ("neck_roll" not in names), *ankles])
     everything = joint_angles(R, skeleton.T_world_body)
-    for joint, degrees in joint_angles(R, skeleton.T_world_body, pose_names=skeleton.names).items():
-        unmeasured = np.isin(BY_JOINT[joint].names, BY_JOINT[joint].unmeasured(skeleton.names))
+    for joint, degrees in joint_angles(R, skeleton.T_world_body, pose_names=names).items():
+        unmeasured = np.isin(BY_JOINT[joint].names, list(BY_JOINT[joint].unmeasured(names)))
         assert np.isnan(degrees[:, unmeasured]).all() and (np.ptp(degrees[:, ~unmeasured], axis=0) > 1).all()
-        if joint != "neck":
-            assert (np.abs(everything[joint][:, unmeasured]) < 1e-9).all()
+        assert (np.abs(everything[joint][:, unmeasured]) < 1e-9).all()
+
+
+def test_turn_of_the_head_is_a_number_only_if_landmarks_were_used() -> None:
+    R = segment_rotations(SKELETON, pose_of(neck_roll=30.0, neck_pitch=10.0)[None])
+    seen, unseen = (joint_angles(R, np.eye(3), landmarks=used) for used in (True, False))
+    np.testing.assert_allclose(seen["neck"], [[10.0, 0.0, 30.0]], atol=1e-9)
+    np.testing.assert_array_equal(unseen["neck"], [[seen["neck"][0, 0], seen["neck"][0, 1], np.nan]])
+    assert BY_JOINT["neck"].unmeasured(SKELETON.names, landmarks=False) == {"rotation": UNSEEN}
+    assert BY_JOINT["neck"].unmeasured(BODIES[1], landmarks=False) == {"rotation": UNMEASURED}
+    assert by_reason({"a": "x", "b": "y", "c": "x"}) == "a, c: x; b: y"
 
 
 def test_standing_segments_are_aligned() -> None:

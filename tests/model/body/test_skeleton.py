@@ -8,7 +8,7 @@ from scipy.linalg import expm
 
 from tk.model.body.anthropometry import FRACTIONS, RAISED_SHOULDERS, BodyDimensions
 from tk.model.body.gait_poses import neutral_pose
-from tk.model.body.joints import ROWS, WAIST
+from tk.model.body.joints import BODIES, BY_LANDMARKS, ROWS, WAIST
 from tk.model.body.skeleton import (
     CHAINS,
     JOINTS,
@@ -25,6 +25,7 @@ from tk.model.body.skeleton import (
 DIMENSIONS = BodyDimensions.from_stature(1.75)
 SKELETON, PAPER = build_skeleton(DIMENSIONS), build_skeleton(DIMENSIONS, paper=True)
 D = len(SKELETON.names)
+ADDED = ~np.isin(SKELETON.names, PAPER.names)
 EXACT = 1e-12
 UPS = ("x", "y", "z", "-x", "-y", "-z")
 FORWARD, LEFT, UP = np.eye(3)
@@ -55,8 +56,8 @@ def mirrored(pose, skeleton=SKELETON):
     for k, name in enumerate(skeleton.names):
         partner = name.replace("_l_", "_#_").replace("_r_", "_l_").replace("_#_", "_r_")
         # what moves along y, or turns about an axis in the plane of symmetry, changes its sign
-        sign = -1 if name in ("torso_y", "torso_yaw", "torso_roll", "neck_yaw", "waist_roll", "waist_yaw") else 1
-        result[skeleton.index(partner)] = sign * pose[k]
+        odd = ("torso_y", "torso_yaw", "torso_roll", "neck_yaw", "neck_roll", "waist_roll", "waist_yaw")
+        result[skeleton.index(partner)] = -pose[k] if name in odd else pose[k]
     return result
 
 
@@ -86,11 +87,15 @@ def test_joints_parents_and_degrees_of_freedom_of_the_papers_skeleton():
     ]
 
 
-def test_waist_and_ankles_are_seven_more_degrees_of_freedom():
+def test_waist_ankles_and_the_heads_turn_are_eight_more_degrees_of_freedom():
     s = SKELETON
-    assert tuple(np.array(s.names)[~s.is_straight]) == PAPER.names
-    assert (s.parent < np.arange(D)).all() and D == 31
+    assert tuple(np.array(s.names)[~ADDED]) == PAPER.names
+    assert (s.parent < np.arange(D)).all() and D == 32
     assert tuple(np.array(s.names)[s.is_waist]) == ROWS[WAIST].dof_names
+    assert [s.names[k] for k in np.flatnonzero(s.is_by_landmarks)] == list(BY_LANDMARKS) == ["neck_roll"]
+    turn = s.index("neck_roll")
+    assert [SEGMENTS[k] for k in np.flatnonzero(s.ancestors[:, turn])] == ["head"]
+    np.testing.assert_allclose(np.degrees([s.lower[turn], s.upper[turn]]), [-80.0, 80.0])
     legs = {"pelvis"} | {f"{segment}_{side}" for segment in ("thigh", "calf", "foot") for side in "lr"}
     moving = {WAIST: legs, "ankle_l": {"foot_l"}, "ankle_r": {"foot_r"}}
     for joint, segments in moving.items():
@@ -99,12 +104,10 @@ def test_waist_and_ankles_are_seven_more_degrees_of_freedom():
         assert (moved.any(axis=1) == moved.all(axis=1)).all()
 
 
-def test_straight_waist_and_ankles_change_nothing():
+def test_straight_waist_ankles_and_neck_change_nothing():
     poses = SKELETON.clip(np.random.default_rng(3).normal(0, 0.4, (20, D)))
-    poses[:, SKELETON.is_straight] = 0
-    found, expected = (
-        s.segment_transforms(p) for s, p in ((SKELETON, poses), (PAPER, poses[:, ~SKELETON.is_straight]))
-    )
+    poses[:, ADDED] = 0
+    found, expected = (s.segment_transforms(p) for s, p in ((SKELETON, poses), (PAPER, poses[:, ~ADDED])))
     np.testing.assert_allclose(found, expected, atol=EXACT)
 
 
@@ -133,6 +136,9 @@ def test_signs_of_the_ankles_are_anatomical(side):
 def test_paper_pose_keeps_the_orientation_of_trunk_head_and_limbs(up, seed):
     skeleton, plain = (build_skeleton(DIMENSIONS, up, paper) for paper in (False, True))
     poses = skeleton.clip(np.random.default_rng(seed).normal(0, 0.5, (2, D)))
+    turn = skeleton.index("neck_roll")
+    np.testing.assert_array_equal(paper_poses(skeleton, poses), paper_poses(skeleton, poses * (np.arange(D) != turn)))
+    poses[:, turn] = 0.0  # the paper's head does not turn
     paper = paper_poses(skeleton, poses)
     assert paper.shape == (2, 24)
     np.testing.assert_array_equal(paper[1], paper_poses(skeleton, poses[1]))
@@ -147,16 +153,24 @@ def test_paper_pose_keeps_the_orientation_of_trunk_head_and_limbs(up, seed):
 def test_poses_of_another_skeleton_are_taken_by_name():
     pose = PAPER.clip(random_pose(3)[:24])
     full = convert_poses(pose, PAPER, SKELETON)
-    assert not full[SKELETON.is_straight].any()
+    assert not full[ADDED].any()
     np.testing.assert_array_equal(full[np.isin(SKELETON.names, PAPER.names)], pose)
     np.testing.assert_allclose(convert_poses(full, SKELETON, PAPER), pose, atol=1e-12)
 
 
 def test_skeleton_is_found_by_the_names_of_its_pose_vector():
-    for skeleton in (SKELETON, PAPER):
-        assert skeleton_of_names(skeleton.names, DIMENSIONS, "z").names == skeleton.names
+    for names in BODIES:
+        assert skeleton_of_names(names, DIMENSIONS, "z").names == names
     with pytest.raises(ValueError, match="waist_pitch"):
         skeleton_of_names([name for name in SKELETON.names if name != "waist_pitch"], DIMENSIONS, "z")
+
+
+def test_head_does_not_turn_in_poses_of_files_from_before_it_could():
+    before = skeleton_of_names(BODIES[1], DIMENSIONS, "z")
+    pose = before.clip(random_pose(5)[: D - 1])
+    full = convert_poses(pose, before, SKELETON)
+    assert full[SKELETON.index("neck_roll")] == 0.0
+    np.testing.assert_allclose(SKELETON.segment_transforms(full), before.segment_transforms(pose), atol=EXACT)
 
 
 @pytest.mark.parametrize("up", ["z", "-y"])
@@ -185,7 +199,7 @@ def test_transforms_are_the_products_of_exponentials(up, seed):
 def test_each_degree_of_freedom_belongs_to_torso_waist_or_one_chain():
     free = np.array([SKELETON.chain_dofs(c) for c in CHAINS])
     assert free.sum(axis=0).max() == 1
-    assert free.sum(axis=1).tolist() == [2, 4, 4, 6, 6]
+    assert free.sum(axis=1).tolist() == [3, 4, 4, 6, 6]
     assert [SKELETON.names[k] for k in np.flatnonzero(~free.any(axis=0))] == [
         "torso_x",
         "torso_y",
@@ -288,6 +302,8 @@ def test_signs_are_anatomical(side):
     assert moved(f"knee_{side}", **{f"hip_{side}_yaw": 30}) @ outward > 0.1, "abduction is positive yaw"
     assert moved("head_top", neck_pitch=30) @ FORWARD > 0.05, "a nod is positive pitch"
     assert moved("head_top", torso_pitch=30) @ FORWARD > 0.1, "a bow is positive pitch"
+    nose = SKELETON.segment_transforms(posed(neck_roll=30))[SEGMENTS.index("head"), :3, :3] @ FORWARD
+    assert nose @ LEFT == pytest.approx(0.5), "a turn of the head to the left is positive"
 
 
 @pytest.mark.parametrize("side", ["l", "r"])

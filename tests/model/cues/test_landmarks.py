@@ -11,6 +11,7 @@ from tests.model.landmarks import body_points, landmarks_of, mirrored
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, NAMES, STATURE, walk
 from tk.kernels.mask_values import OTHERS
+from tk.model.body.body_points import POINTS
 from tk.model.body.limb_candidates import limbs_of, turned
 from tk.model.body.skeleton import JOINTS
 from tk.model.cues.landmarks import (
@@ -61,6 +62,20 @@ def test_gradient_is_that_of_the_cost_with_offsets_integrated_out() -> None:
     step = 1e-5 * np.eye(len(POSE))
     expected = [(marginal_cost(near + row, seen) - marginal_cost(near - row, seen)) / 2e-5 for row in step]
     np.testing.assert_allclose(gradient, expected, atol=0.02 * np.abs(expected).max())
+
+
+def test_head_turns_to_where_the_face_is_seen_and_is_straight_without_it() -> None:
+    turn, pose = NAMES.index("neck_roll"), POSE.copy()
+    pose[turn] = np.radians(50.0)
+    seen = landmarks_of(RIG, BODY, pose, 0.01)
+    assert propose(RIG, BODY, seen, POSE[:3])[0][turn] == pytest.approx(pose[turn], abs=np.radians(10))
+    seen[:, [POINTS[name].segment == "head" for name in LANDMARKS]] = np.nan
+    cue, precision = LandmarkCue(RIG, BODY, seen), BODY.skeleton.by_landmarks[turn] ** -2.0
+    matrix = cue.normal(pose[None]).matrix[0, turn]
+    np.testing.assert_array_equal(matrix, precision * (np.arange(len(pose)) == turn))
+    straight, turned_head = cue.score(np.stack([POSE, pose]))
+    assert turned_head - straight == pytest.approx(0.5 * precision * pose[turn] ** 2)
+    assert propose(RIG, BODY, seen, POSE[:3])[0][turn] == pytest.approx(0.0, abs=1e-3)
 
 
 def test_matrix_is_symmetric_and_positive_semi_definite_even_of_wrong_landmarks() -> None:

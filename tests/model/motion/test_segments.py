@@ -27,7 +27,7 @@ def test_agrees_with_the_skeleton(up: str, paper: bool) -> None:
 
 def test_feet_stand_on_the_floor() -> None:
     skeleton = build_skeleton(BODY)
-    T = skeleton.segment_transforms(np.zeros((1, 31)))
+    T = skeleton.segment_transforms(np.zeros((1, len(skeleton.names))))
     feet = foot_points(skeleton, BODY, T)[0]
     ankle = joint_positions(skeleton, T)[0, JOINTS.index("ankle_l")]
     np.testing.assert_allclose(feet[:, 2], ankle[2] - BODY.ankle_height)

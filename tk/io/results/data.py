@@ -15,7 +15,7 @@ from tk.io.results.schema import ROWS as DATASETS
 from tk.io.results.schema import columns_of
 from tk.io.results.status import Status, has_pose
 from tk.io.toml import parse_toml
-from tk.model.body.angles import ANGLES, UNMEASURED
+from tk.model.body.angles import ANGLES, by_reason
 from tk.model.body.anthropometry import AVERAGE_BODY
 from tk.model.body.expected_error import expected_errors, in_cm, mean_range
 from tk.model.body.joints import JOINTS, in_joint_order
@@ -42,14 +42,14 @@ class JointAngles:
     unmeasured: str = ""  # angles that are NaN in every frame, with the reason
 
     @classmethod
-    def of_body(cls, pose_names: Sequence[str]) -> tuple[JointAngles, ...]:
-        """Return all joints, of a body with these degrees of freedom."""
+    def of_body(cls, pose_names: Sequence[str], landmarks: bool = True) -> tuple[JointAngles, ...]:
+        """Return all joints, of a body with these degrees of freedom; ``landmarks``: whether they were used."""
         return tuple(
             cls(
                 angles.joint,
                 angles.names,
                 angles.convention,
-                f"{', '.join(missing)}: {UNMEASURED}" if (missing := angles.unmeasured(pose_names)) else "",
+                by_reason(angles.unmeasured(pose_names, landmarks)),
             )
             for angles in ANGLES
         )

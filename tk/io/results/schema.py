@@ -79,7 +79,7 @@ ROWS = (
     Dataset("time", "F", "float64", "seconds", field="time", finite=True),
     Dataset(
         "pose", "F D", "float64",
-        "the pose vector, one column per degree of freedom (31 by default, 24 with `--method volumetric`)",
+        "the pose vector, one column per degree of freedom (32 by default, 24 with `--method volumetric`)",
         {"names": "pose_names", "units": "pose_units"}, field="pose", smoothed=True,
     ),
     Dataset(

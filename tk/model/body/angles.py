@@ -13,13 +13,13 @@ Rotations of left limbs are mirrored first, so that the same movement has the sa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.body.joints import ARM, CROOK, ROWS, TABLE, WAIST
+from tk.model.body.joints import ARM, BODIES, BY_LANDMARKS, CROOK, ROWS, WAIST
 from tk.model.body.rotations import decompose
 from tk.model.body.skeleton import SEGMENTS, Skeleton
 
@@ -54,22 +54,28 @@ class AngleSet:
         """Return the names of the angles, in the order of the columns."""
         return tuple(name for name, _, _ in self.columns)
 
-    def unmeasured(self, pose_names: Sequence[str]) -> tuple[str, ...]:
-        """Return the angles about whose axis a body with these degrees of freedom does not turn at the joint.
+    def unmeasured(self, pose_names: Sequence[str], landmarks: bool = True) -> dict[str, str]:
+        """Return the angles that are the same in all poses, which is no measurement, each with the reason.
 
-        Such an angle is the same in all poses, which is no measurement.
+        Args:
+            pose_names: the body's degrees of freedom; about the axis of the angle it may have none at the joint.
+            landmarks: whether landmarks were used, see :data:`~tk.model.body.joints.BY_LANDMARKS`.
         """
+        seen = [name for name in pose_names if landmarks or name not in BY_LANDMARKS]
+        return {
+            name: UNSEEN if self._turns(pose_names, k) else UNMEASURED
+            for name, k, _ in self.columns
+            if not self._turns(seen, k)
+        }
+
+    def _turns(self, pose_names: Sequence[str], k: int) -> bool:
+        """Return whether a body with these degrees of freedom turns about axis k of the sequence at the joint."""
         row = ROWS.get(WAIST if self.joint == "lumbar" else self.joint)
         if self.parent is None or row is None:
-            return ()
+            return True
         axes = [_ISB.T @ dof.axis for dof, name in zip(row.dofs, row.dof_names, strict=True) if name in pose_names]
-        if len(axes) >= len(self.names):  # the arms' axes are oblique
-            return ()
-        return tuple(
-            name
-            for name, k, _ in self.columns
-            if not any(abs(axis["xyz".index(self.sequence[k])]) > 0.5 for axis in axes)
-        )
+        # the arms' axes are oblique
+        return len(axes) >= len(self.names) or any(abs(axis["xyz".index(self.sequence[k])]) > 0.5 for axis in axes)
 
     @property
     def mirrored(self) -> bool:
@@ -147,9 +153,17 @@ def _sets() -> tuple[AngleSet, ...]:
 
 ANGLES: tuple[AngleSet, ...] = _sets()
 #: all degrees of freedom of the body
-DOF_NAMES = tuple(name for row in TABLE for name in row.dof_names)
+DOF_NAMES = BODIES[0]
 #: why an angle is NaN in every frame
-UNMEASURED = "the body has no degree of freedom for it"
+UNMEASURED, UNSEEN = "the body has no degree of freedom for it", "only landmarks show it, and none were used"
+
+
+def by_reason(unmeasured: Mapping[str, str]) -> str:
+    """Return what is NaN in every frame (name → reason) as a text, such as ``a, b: reason``; "" if nothing is."""
+    reasons = dict.fromkeys(unmeasured.values())
+    return "; ".join(
+        f"{', '.join(name for name, why in unmeasured.items() if why == reason)}: {reason}" for reason in reasons
+    )
 
 
 def standing_rotations(skeleton: Skeleton, transforms: Float) -> Float:
@@ -172,6 +186,7 @@ def joint_angles(
     T_world_body: Float,
     segments: Sequence[str] = SEGMENTS,
     pose_names: Sequence[str] = DOF_NAMES,
+    landmarks: bool = True,
 ) -> dict[str, Float]:
     """Return the angles by joint, degrees, each (..., k) with the columns of :data:`ANGLES`; NaN if unmeasured.
 
@@ -180,6 +195,7 @@ def joint_angles(
         T_world_body: (3, 3) the world's forward, left and up axes as columns; see :class:`Skeleton`.
         segments: names of the S segments.
         pose_names: names of the degrees of freedom that the body has.
+        landmarks: whether landmarks were used.
     """
     result = {}
     for angles in ANGLES:
@@ -190,7 +206,7 @@ def joint_angles(
         child = rotations[..., segments.index(angles.child), :, :]
         turns = decompose(angles.sequence, _in_isb(np.swapaxes(parent, -1, -2) @ child, angles.mirrored))
         degrees = np.degrees(np.stack([sign * turns[..., k] for _, k, sign in angles.columns], axis=-1))
-        degrees[..., np.isin(angles.names, angles.unmeasured(pose_names))] = np.nan
+        degrees[..., np.isin(angles.names, list(angles.unmeasured(pose_names, landmarks)))] = np.nan
         result[angles.joint] = degrees
     return result
 

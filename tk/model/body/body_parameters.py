@@ -161,7 +161,8 @@ class LinearisedBody:
         rows = np.empty((len(pose), self.twists.shape[-1]))
         for m in np.unique(pose):
             rows[pose == m] = wrench[pose == m] @ self.twists[m]
-        rows[~self.body.skeleton.ancestors[self.body.frames[0][edgels.part]]] = 0.0
+        skeleton = self.body.skeleton
+        rows[~skeleton.ancestors[self.body.frames[0][edgels.part]] | skeleton.is_by_landmarks] = 0.0
         return rows
 
     def rows(self, pose: NDArray[np.integer], edgels: Edgels) -> Float:

@@ -119,6 +119,7 @@ class ConeBody:
             dof=self.skeleton.segment_dof[segments],
             limb=CHAIN_OF_SEGMENT[segments],
             group=self.color_group,
+            moved=self.skeleton.contour_dof[segments],
         )
         return ConeArrays(self.skeleton.tree.astype(dtype), parts.astype(dtype), np.array(curves, np.int32))
 

@@ -42,6 +42,10 @@ class Dof:
     # standard deviation, degrees, of a joint that is nearly straight in most frames: its prior is about zero. Infinite:
     # the prior is about the predicted angle.
     straight_deg: float = np.inf
+    # standard deviation about zero, degrees, of an angle that only landmarks show, see :mod:`tk.model.cues.landmarks`:
+    # contours do not move it. Infinite: contours show it.
+    landmarks_deg: float = np.inf
+    added: bool = False  # whether it is beyond the paper's 24
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,6 @@ class Joint:
     chain: str = ""  # the chain that is optimised as one (section 6.4); empty for the trunk
     carrier: str = ""  # the segment that carries the joint centre in `/joints/position`; empty: not an output
     bone_from: str = ""  # the joint at the other end of the bone in drawings; empty at the root
-    added_dofs: bool = False  # whether its degrees of freedom are beyond the paper's 24
     offset_m: float = np.nan  # constant offset of the output joint from a ground truth's, mean length, metres
     # True for an output joint beyond the 15 that every result and ground truth has; readers return NaN for a file
     # without it
@@ -72,6 +75,11 @@ class Joint:
     def dof_names(self) -> tuple[str, ...]:
         """Names of its entries of the pose vector."""
         return tuple(f"{self.name}_{dof.name}" for dof in self.dofs)
+
+    @property
+    def is_added(self) -> bool:
+        """Whether the paper's joint does not turn."""
+        return bool(self.dofs) and all(dof.added for dof in self.dofs)
 
 
 def side_of(name: str) -> str:
@@ -109,14 +117,18 @@ def _neck(d: BodyDimensions) -> Float:
 # 143±5; elbow 143±6. The shoulder's ranges (flexion 167±5, extension 62±10, abduction 184±7, rotation 69/104) are given
 # about other axes than ours: the box below holds them, and every direction of the arm but a cone of 10° about the
 # singular diagonal (tests/model/body/test_skeleton.py samples them). Neck: Youdas et al., Phys. Ther. 72 (1992)
-# 770-780: flexion and extension 60-70 together with the upper spine, lateral bending 40-45. Waist: textbook ranges of
-# the lumbar spine (flexion 50, extension 15, bending 20-25, rotation 5-10), more for the rotation of the chest. Ankle:
-# Boone & Azen, plantar flexion 56±6, dorsiflexion 13±4 (more when the knee is bent and loaded), inversion 37±5,
-# eversion 21±5.
+# 770-780: flexion and extension 60-70 together with the upper spine, lateral bending 40-45, rotation 70. Waist:
+# textbook ranges of the lumbar spine (flexion 50, extension 15, bending 20-25, rotation 5-10), more for the rotation of
+# the chest. Ankle: Boone & Azen, plantar flexion 56±6, dorsiflexion 13±4 (more when the knee is bent and loaded),
+# inversion 37±5, eversion 21±5.
 #
 # Standard deviations of waist and ankles about zero, degrees. Chosen on the development captures; half and twice the
 # value change the mean errors of walk (32 frames) by 0.01 cm.
 _WAIST_DEG, _ANKLE_DEG = 12.0, 20.0
+# Standard deviation of the head's turn about the neck, degrees. Assumed: it makes a turn that three images of the face
+# show smaller by 10 %, with 30 by 20 %. With 15 to 60 the joints of four real people, arms excepted, are 3.7 to 3.8 cm
+# off on average.
+_HEAD_TURN_DEG = 45.0
 # `offset_m`: length of the median offset in the trunk's frame, which `tk evaluate` removes, mean over both sides and
 # the recordings that docs/evaluation.md lists (`python -m scripts.joint_offsets`).
 _MIDDLE = (
@@ -125,13 +137,14 @@ _MIDDLE = (
         Dof("yaw", _Z), Dof("roll", _X, -80.0, 80.0), Dof("pitch", _Y),
     )),
     Joint("waist", lambda d: WAIST_HEIGHT * d.trunk * _Z, above="torso", turns="pelvis", dofs=(
-        Dof("roll", _X, -30.0, 30.0, straight_deg=_WAIST_DEG),
-        Dof("pitch", -_Y, -25.0, 50.0, straight_deg=_WAIST_DEG),
-        Dof("yaw", _Z, -35.0, 35.0, straight_deg=_WAIST_DEG),
-    ), added_dofs=True),
+        Dof("roll", _X, -30.0, 30.0, straight_deg=_WAIST_DEG, added=True),
+        Dof("pitch", -_Y, -25.0, 50.0, straight_deg=_WAIST_DEG, added=True),
+        Dof("yaw", _Z, -35.0, 35.0, straight_deg=_WAIST_DEG, added=True),
+    )),
     Joint("pelvis", lambda d: np.zeros(3), above="waist", carrier="pelvis", offset_m=0.017),
     Joint("neck", _neck, above="torso", turns="head", chain="head", carrier="torso", bone_from="pelvis", dofs=(
         Dof("pitch", _Y, -70.0, 65.0), Dof("yaw", _X, -50.0, 50.0),
+        Dof("roll", _Z, -80.0, 80.0, landmarks_deg=_HEAD_TURN_DEG, added=True),
     ), offset_m=0.017),
     Joint("head_top", lambda d: _neck(d) + d.head * _Z, above="neck", chain="head", carrier="head", bone_from="neck",
           offset_m=0.020),
@@ -152,8 +165,8 @@ _LEG_ROWS = (
     Joint("knee", _knee, above="hip", turns="calf", chain="leg", carrier="thigh", bone_from="hip",
           dofs=(Dof("flexion", _Y, -10.0, 160.0),), offset_m=0.013),
     Joint("ankle", _ankle, above="knee", turns="foot", chain="leg", carrier="calf", bone_from="knee",
-          dofs=(Dof("flexion", -_Y, -60.0, 40.0, straight_deg=_ANKLE_DEG),
-                Dof("inversion", -_X, -30.0, 40.0, straight_deg=_ANKLE_DEG)), added_dofs=True, offset_m=0.011),
+          dofs=(Dof("flexion", -_Y, -60.0, 40.0, straight_deg=_ANKLE_DEG, added=True),
+                Dof("inversion", -_X, -30.0, 40.0, straight_deg=_ANKLE_DEG, added=True)), offset_m=0.011),
 )  # fmt: skip
 
 
@@ -190,7 +203,15 @@ JOINTS = tuple(row.name for added in (False, True) for row in TABLE if row.carri
 #: those that every result and ground truth has
 REQUIRED_JOINTS = tuple(name for name in JOINTS if not ROWS[name].added)
 #: segments of `/segments/rotation`: what the paper's joints turn, then what the others turn
-SEGMENTS = tuple(row.turns for added in (False, True) for row in TABLE if row.turns and row.added_dofs == added)
+SEGMENTS = tuple(row.turns for added in (False, True) for row in TABLE if row.turns and row.is_added == added)
+#: names of the degrees of freedom of the bodies that results have: tk's body, the same in files written before the
+#: head turned, and the paper's body
+BODIES = tuple(
+    tuple(name for row in TABLE for dof, name in zip(row.dofs, row.dof_names, strict=True) if has(dof))
+    for has in (lambda _: True, lambda dof: np.isinf(dof.landmarks_deg), lambda dof: not dof.added)
+)
+#: those that only landmarks show
+BY_LANDMARKS = tuple(name for name in BODIES[0] if name not in BODIES[1])
 #: the degrees of freedom with which the trunk leans
 LEANS = tuple(
     f"{row.name}_{dof.name}"

@@ -1,5 +1,5 @@
-"""The skeleton: a tree of exponential twists with 24 degrees of freedom (Kehl 2006, section 5.1, figure 5a), and three
-more for the waist if wanted.
+"""The skeleton: a tree of exponential twists with 24 degrees of freedom (Kehl 2006, section 5.1, figure 5a), and eight
+more for the waist, the ankles and the head's turn if wanted.
 
 A pose is a configuration vector p. The transform after degree of freedom k is
 
@@ -15,7 +15,7 @@ directions are hardly ever taken: a leg straight to the side, the trunk lying on
 back-out-up / forward-in-down, which is at least 54° away from hanging, raised, forward, backward and sideways.
 
 Beyond the paper: a waist, three rotations between trunk and pelvis about the lumbar spine. A dancer's hips stay level
-while the trunk leans; the paper's torso takes them along.
+while the trunk leans; the paper's torso takes them along. The ankles turn, and the head turns about the neck.
 :func:`paper_poses` gives a pose in the paper's 24 degrees of freedom.
 """
 
@@ -33,6 +33,7 @@ from tk.model.body.anthropometry import AVERAGE_BODY, FRACTIONS, RAISED_SHOULDER
 from tk.model.body.joints import (
     ARM,
     ARM_POLE,
+    BODIES,
     CHAINS,
     HIPS,
     JOINTS,
@@ -63,8 +64,8 @@ _AHEAD, _BEHIND = [1, 2, 0], [2, 0, 1]  # axes after and before each of the thre
 class Skeleton:
     """The kinematic tree as plain arrays: D = 24 degrees of freedom, S = 13 segments, J = 15 joints.
 
-    Optional joints have more: a waist three, ankles two each; without them pelvis and feet are carried by torso and
-    calves.
+    tk's body has more: the waist three, the ankles two each, the neck one; without them pelvis and feet are carried by
+    torso and calves.
     """
 
     names: tuple[str, ...]  # (D,) names of the degrees of freedom; translations first
@@ -81,6 +82,8 @@ class Skeleton:
     # (D,) radians, standard deviation about zero of a joint that is nearly straight in most frames; infinite for the
     # others
     straight: Float
+    # (D,) radians, standard deviation about zero of an angle that only landmarks show; infinite for the others
+    by_landmarks: Float
     segment_dof: NDArray[np.int32]  # (S,) the last degree of freedom above each segment
     joint_segment: NDArray[np.int32]  # (J,) the segment that carries each joint
     joint_position: Float  # (J, 3) joint centres in the zero configuration, metres
@@ -100,6 +103,11 @@ class Skeleton:
     def is_straight(self) -> NDArray[np.bool_]:
         """(D,) True where :attr:`straight` is finite."""
         return np.isfinite(self.straight)
+
+    @cached_property
+    def is_by_landmarks(self) -> NDArray[np.bool_]:
+        """(D,) True where :attr:`by_landmarks` is finite: contours do not move it."""
+        return np.isfinite(self.by_landmarks)
 
     def index(self, name: str) -> int:
         """Return the position of a degree of freedom in the pose vector."""
@@ -263,6 +271,14 @@ class Skeleton:
                 k = self.parent[k]
         return result
 
+    @cached_property
+    def contour_dof(self) -> NDArray[np.int32]:
+        """(S,) the last degree of freedom above each segment that its contours move."""
+        result = self.segment_dof.copy()
+        while (hidden := self.is_by_landmarks[result]).any():
+            result[hidden] = self.parent[result[hidden]]
+        return result
+
     def chain_dofs(self, chain: str) -> NDArray[np.bool_]:
         """Return (D,) True for the degrees of freedom of one of :data:`CHAINS`; the torso's are in none of them."""
         return np.isin(self.names, [name for row in TABLE if row.chain == chain for name in row.dof_names])
@@ -354,8 +370,13 @@ def build_skeleton(dimensions: BodyDimensions, up: str = "z", paper: bool = Fals
         dimensions: lengths, metres. Of N bodies, (N, 1): :attr:`~Skeleton.point`, :attr:`~Skeleton.rise` and
             :attr:`~Skeleton.joint_position` are (N, ...).
         up: see :func:`up_rotation`.
-        paper: whether it has the paper's 24 degrees of freedom only: no waist, no ankles.
+        paper: whether it has the paper's 24 degrees of freedom only: no waist, no ankles, and the head does not turn.
     """
+    return _build(dimensions, up, BODIES[-1] if paper else BODIES[0])
+
+
+def _build(dimensions: BodyDimensions, up: str, names: Sequence[str]) -> Skeleton:
+    """Return the skeleton with the degrees of freedom of these names; see :func:`build_skeleton`."""
     B = up_rotation(up) if up != "z" else np.eye(3)
     dofs: list[tuple[Joint, Dof, str]] = []
     parents: list[int] = []
@@ -363,10 +384,11 @@ def build_skeleton(dimensions: BodyDimensions, up: str = "z", paper: bool = Fals
     segment_dof: dict[str, int] = {}
     for row in TABLE:
         last[row.name] = last[row.above]
-        for dof, name in zip(row.dofs, row.dof_names, strict=True) if not (paper and row.added_dofs) else ():
-            parents.append(last[row.name])
-            dofs.append((row, dof, name))
-            last[row.name] = len(dofs) - 1
+        for dof, name in zip(row.dofs, row.dof_names, strict=True):
+            if name in names:
+                parents.append(last[row.name])
+                dofs.append((row, dof, name))
+                last[row.name] = len(dofs) - 1
         if row.turns:
             segment_dof[row.turns] = last[row.name]
     lift = RAISED_SHOULDERS / FRACTIONS["trunk"] * dimensions.trunk * np.array([0.0, 0.0, 1.0])
@@ -385,6 +407,7 @@ def build_skeleton(dimensions: BodyDimensions, up: str = "z", paper: bool = Fals
         lower=np.radians([dof.lower for _, dof, _ in dofs]),
         upper=np.radians([dof.upper for _, dof, _ in dofs]),
         straight=np.radians([dof.straight_deg for _, dof, _ in dofs]),
+        by_landmarks=np.radians([dof.landmarks_deg for _, dof, _ in dofs]),
         segment_dof=np.array([segment_dof[s] for s in SEGMENTS], dtype=np.int32),
         joint_segment=np.array([SEGMENTS.index(row.carrier) for row in joints], dtype=np.int32),
         joint_position=_rows(row.place(dimensions) for row in joints) @ B.T,
@@ -398,14 +421,13 @@ def _rows(vectors: Iterable[Float]) -> Float:
 
 
 def skeleton_of_names(names: Sequence[str], dimensions: BodyDimensions, up: str) -> Skeleton:
-    """Return the skeleton whose pose vector has entries of these names, in this order.
+    """Return the skeleton whose pose vector has entries of these names, in this order, one of
+    :data:`~tk.model.body.joints.BODIES`.
 
     Raises:
         ValueError: no skeleton has them.
     """
-    found = [build_skeleton(dimensions, up, paper) for paper in (False, True)]
-    for skeleton in found:
-        if skeleton.names == tuple(names):
-            return skeleton
-    different = sorted({*found[0].names} ^ {*names}) or ["other order"]
+    if tuple(names) in BODIES:
+        return _build(dimensions, up, names)
+    different = sorted({*BODIES[0]} ^ {*names}) or ["other order"]
     raise ValueError(f"the pose vector is not one of this body ({different[0]})")

@@ -8,6 +8,9 @@ reports, it is normal; its standard deviation falls with the visibility and is p
 the landmark is anywhere on the person. Networks exchange left and right, for the upper or for the lower body: in each
 image and for either half the likelihood is a mixture of both assignments. Besides, each landmark has an offset to the
 body's point, the same in all images of a frame. It is unknown, with a normal prior; it is integrated out.
+
+An angle that only landmarks show, the head's turn, has a normal prior about zero here. Contours do not move it: without
+landmarks it stays as it is.
 """
 
 from __future__ import annotations
@@ -119,6 +122,8 @@ class LandmarkCue:
         images = np.maximum(np.count_nonzero(known, axis=-2), 1)
         mean = visibility.sum(axis=-2) / images  # (..., L)
         self._offset = (OFFSET_M * size * HIDDEN ** (1.0 - mean)) ** 2
+        # (D,) or (F, D) precision of the angles that only landmarks show, where there are any
+        self._prior = np.any(known, axis=(-2, -1))[..., None] * body.skeleton.by_landmarks**-2.0
 
     @cached_property
     def _cameras(self) -> tuple[Float, Float]:
@@ -126,10 +131,12 @@ class LandmarkCue:
         return np.array([c.rotation for c in self._rig]), np.array([c.translation for c in self._rig])
 
     def normal(self, poses: Float) -> Quadratic:
-        """Return the negative logarithm of the likelihood as a quadratic about each of the poses (B, D), nats."""
+        """Return the negative logarithm of the likelihood, and of the prior of the angles that only landmarks show, as
+        a quadratic about each of the poses (B, D), nats."""
         rows = self.rows(poses)
         matrix, gradient = rows.normal_equations(rows.jacobian)
-        return Quadratic(gradient + (matrix @ poses[..., None])[..., 0], matrix)
+        prior = self._prior[..., None] * np.eye(poses.shape[-1])  # about zero
+        return Quadratic(gradient + (matrix @ poses[..., None])[..., 0], matrix + prior)
 
     def rows(self, poses: Float) -> LandmarkRows:
         """Return the information of the landmarks about the body's points at poses (B, D)."""
@@ -141,8 +148,9 @@ class LandmarkCue:
         return LandmarkRows(information, pull, self._skeleton.point_jacobian(poses, SEGMENT, x))
 
     def score(self, poses: Float) -> Float:
-        """Return (B,) the negative logarithm of the likelihood at poses (B, D), nats, up to a constant of the frame."""
-        return self._likelihood(self._skeleton.points(poses, SEGMENT, self._place)).score
+        """Return (B,) the same at poses (B, D), nats, up to a constant of the frame."""
+        likelihood = self._likelihood(self._skeleton.points(poses, SEGMENT, self._place)).score
+        return likelihood + 0.5 * (self._prior * poses**2).sum(axis=-1)
 
     def variance(self, poses: Float) -> Float:
         """Return (B, J) variance of the joints' positions along an axis, metres², from the distances between poses

@@ -29,9 +29,9 @@ class Derived:
     angles: dict[str, Float]
 
 
-def derive(skeleton: Skeleton, dimensions: BodyDimensions, poses: Float) -> Derived:
-    """Return the quantities derived from finite poses (F, D)."""
-    pieces = [_derive(skeleton, dimensions, block) for block in blocks(poses)]
+def derive(skeleton: Skeleton, dimensions: BodyDimensions, poses: Float, landmarks: bool = True) -> Derived:
+    """Return the quantities derived from finite poses (F, D); ``landmarks``: whether they were used."""
+    pieces = [_derive(skeleton, dimensions, block, landmarks) for block in blocks(poses)]
     return Derived(
         joints=np.concatenate([piece.joints for piece in pieces]),
         rotations=np.concatenate([piece.rotations for piece in pieces]),
@@ -40,12 +40,12 @@ def derive(skeleton: Skeleton, dimensions: BodyDimensions, poses: Float) -> Deri
     )
 
 
-def _derive(skeleton: Skeleton, dimensions: BodyDimensions, poses: Float) -> Derived:
+def _derive(skeleton: Skeleton, dimensions: BodyDimensions, poses: Float, landmarks: bool) -> Derived:
     T = skeleton.segment_transforms(poses)
     R = standing_rotations(skeleton, T)
     return Derived(
         joints=joint_positions(skeleton, T),
         rotations=to_quaternions(R),
         feet=foot_points(skeleton, dimensions, T),
-        angles=joint_angles(R, skeleton.T_world_body, pose_names=skeleton.names),
+        angles=joint_angles(R, skeleton.T_world_body, pose_names=skeleton.names, landmarks=landmarks),
     )
