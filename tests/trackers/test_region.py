@@ -26,6 +26,7 @@ from tk.settings import RegionSettings, Settings, SilhouetteSettings
 from tk.trackers.judgement import UNKNOWN_AFTER
 from tk.trackers.proposals import anywhere, limbs
 from tk.trackers.proposals import exchanged as exchanged_limbs
+from tk.trackers.reason import Reason
 from tk.trackers.region import RegionTracker
 from tk.trackers.residual import LEAST_SPREAD
 from tk.trackers.second_pass import second_of_two
@@ -166,13 +167,31 @@ def test_high_residual_triggers_a_limb_search() -> None:
     assert errors(estimate, raised)[JOINTS.index("wrist_r")] < 0.08
 
 
-def test_sigma_is_unknown_while_the_residual_stays_high() -> None:
-    tracker = tracker_at(POSES[0])
-    nonsense = MASKS[0].copy()
-    for mask in nonsense:  # surplus area of half the person's pixels
+def with_surplus_area(masks: np.ndarray) -> np.ndarray:
+    """Return masks (C, H, W) with surplus area of half the person's pixels."""
+    masks = masks.copy()
+    for mask in masks:
         rows, columns = np.nonzero(mask)
         across = int(0.5 * len(rows) / np.ptp(rows))
         mask[rows.min() : rows.max(), max(columns.min() - across, 0) : columns.min()] = 255
+    return masks
+
+
+def test_pose_with_a_high_residual_after_a_loss_is_refused_with_two_cameras_too() -> None:
+    two = MASKS[0].copy()
+    two[2] = 0
+    tracker = tracker_at(POSES[0])
+    shown = (two, np.zeros_like(two), with_surplus_area(MASKS[0]) * (two.any(axis=(1, 2))[:, None, None]), two)
+    estimates = [tracker.step(observe(masks, i)) for i, masks in enumerate(shown)]
+    reasons = [estimate.reason for estimate in estimates]
+    assert reasons == [Reason.NONE, Reason.NOBODY, Reason.STILL_HIGH, Reason.NONE]
+    assert [estimate.status for estimate in estimates] == ["initialised", "lost", "lost", "recovered"]
+    assert estimates[2].sigma is not None and np.isnan(estimates[2].sigma).all()
+    assert estimates[2].deviation is not None and np.isfinite(estimates[2].deviation).all()
+
+
+def test_sigma_is_unknown_while_the_residual_stays_high() -> None:
+    tracker, nonsense = tracker_at(POSES[0]), with_surplus_area(MASKS[0])
     estimates = [tracker.step(observe(masks)) for masks in (MASKS[0], *[nonsense] * UNKNOWN_AFTER, MASKS[0])]
     assert all(estimate.status != "lost" for estimate in estimates)
     known = [np.isfinite(estimate.sigma).any() for estimate in estimates if estimate.sigma is not None]
