@@ -1,9 +1,9 @@
 """Offsets from flashes and other sudden changes of the light that all cameras see.
 
-An image that saw the light for a part of its exposure gives the instant of the change, if the length of the exposure is
-known; two images with the light off and on give a range. The exposure, with the readout of a rolling shutter, is
-unknown, and the same at all changes of a camera: the likelihood of an offset is summed over all lengths. A time stamp
-counts as the middle of the exposure.
+The images about a change show the share of their exposures that saw the light, which gives the instant of the change if
+the length of the exposure is known. The length, with the readout of a rolling shutter, is unknown, and the same at all
+changes of a camera: the likelihood of an offset is summed over all lengths. A time stamp counts as the middle of the
+exposure.
 """
 
 from __future__ import annotations
@@ -28,11 +28,13 @@ _SHARE = 0.5
 _MOST_EVENTS = 12
 #: a lone change convinces if it is so many times the second largest of the camera
 _LONE = 3.0
+#: a change continues in the image before or after if that changes the same way by so many times the common change
+_CONTINUES = 3.0
 #: standard deviation of the share of an exposure that saw the light: rows that are read later, and the gamma of cameras
 _SHARE_SIGMA = 0.1
 #: seconds of changes that give one offset: clocks drift apart by 2 ms at most
 _TOGETHER_S = 30.0
-#: samples of an interval, and lengths of the exposure, in the likelihood
+#: samples of an interval, and lengths of the exposure as shares of a camera's interval, in the likelihood
 _STEPS, _LENGTHS = 60, np.linspace(0.1, 1.0, 10)
 
 
@@ -42,27 +44,30 @@ class Event:
 
     Attributes:
         own_s: its own time, seconds, within half of an interval.
-        interval_s: of the images, seconds.
+        interval_s: of the camera's images, seconds.
         change: grey levels.
-        off_s, on_s: own times of the last image before and the first one after the change.
-        lit: share of its exposure after the change, of an image at ``own_s``; None without such an image.
+        times_s: (M,) own times of the images about the change.
+        lit: (M,) share of their exposures after the change; 0 for the first, 1 for the last.
+        sigma: standard deviation of these shares.
     """
 
     own_s: float
     interval_s: float
     change: float
-    off_s: float
-    on_s: float
-    lit: float | None
+    times_s: Float
+    lit: Float
+    sigma: float
+
+    @property
+    def gap_s(self) -> float:
+        """Longest interval of the images about the change, seconds."""
+        return float(np.diff(self.times_s).max())
 
     def likelihood(self, times: Float) -> Float:
         """Return (E, N) for each length of the exposure, the likelihood that the light changed at own times (N,)."""
-        open_s = _LENGTHS[:, None] * self.interval_s
-        sigma = _SHARE_SIGMA * open_s
-        if self.lit is not None:
-            return np.exp(-0.5 * ((times - self.own_s - open_s * (0.5 - self.lit)) / sigma) ** 2)
-        outside = np.maximum(self.off_s + open_s / 2 - times, times - self.on_s + open_s / 2)
-        return np.exp(-0.5 * (np.maximum(outside, 0.0) / sigma) ** 2)
+        open_s = (_LENGTHS * self.interval_s)[:, None, None]
+        lit = np.clip(0.5 + (self.times_s - times[:, None]) / open_s, 0.0, 1.0)
+        return np.asarray(np.exp(-0.5 * (((self.lit - lit) / self.sigma) ** 2).sum(axis=2)))
 
 
 def find_events(look: Look) -> list[Event]:
@@ -76,29 +81,29 @@ def find_events(look: Look) -> list[Event]:
         if not large[k]:
             k += 1
             continue
-        last = k  # a change that two images share
-        if k + 1 < len(steps) and np.sign(steps[k + 1]) == np.sign(steps[k]) and abs(steps[k + 1]) > 3 * common:
-            last = k + 1
-        if (event := _event(look, k, last)) is not None:
+        first = last = k  # up to three steps: images that saw the light for a part of their exposure
+        along = steps * np.sign(steps[k]) > _CONTINUES * common
+        first -= k > 0 and bool(along[k - 1]) and not large[k - 1]
+        last += k + 1 < len(steps) and bool(along[k + 1])
+        if (event := _event(look, first, last, common)) is not None:
             events.append(event)
         k = last + 1
     return events
 
 
-def _event(look: Look, first: int, last: int) -> Event | None:
-    """Return the event of the changes ``first`` to ``last``; None if only a part of the image changes."""
+def _event(look: Look, first: int, last: int, common: float) -> Event | None:
+    """Return the event of the changes ``first`` to ``last``; None if only a part of the image changes. ``common``: the
+    common change, grey levels."""
     before, after = look.greys[first].astype(np.float32), look.greys[last + 1].astype(np.float32)
     change = float((after - before).mean())
-    if change > 0 and float((after - before > change / 2).mean()) < _SHARE:
+    if change == 0 or float(((after - before) * np.sign(change) > abs(change) / 2).mean()) < _SHARE:
         return None
-    if change < 0 and float((after - before < change / 2).mean()) < _SHARE:
-        return None
-    off, on = float(look.times_s[first]), float(look.times_s[last + 1])
-    interval = (on - off) / (last + 1 - first)
-    if last == first:  # the light changed between the exposures
-        return Event((off + on) / 2, interval, change, off, on, None)
-    lit = float((look.brightness[last] - look.brightness[first]) / change)
-    return Event(float(look.times_s[last]), interval, change, off, on, min(max(lit, 0.0), 1.0))
+    near = slice(first, last + 2)
+    times, lit = look.times_s[near], np.clip((look.brightness[near] - look.brightness[first]) / change, 0.0, 1.0)
+    partly = (lit * (1 - lit)).argmax()  # the image that saw most of the change
+    own = float(times[partly]) if last > first else float(times.mean())
+    sigma = float(np.hypot(_SHARE_SIGMA, common / change))
+    return Event(own, float(np.median(np.diff(look.times_s))), change, times, lit, sigma)
 
 
 def compare_events(looks: Sequence[Look]) -> list[Tie]:
@@ -120,7 +125,7 @@ def _match(i: int, j: int, one: Sequence[Event], other: Sequence[Event]) -> list
         pairs = []
         for a in one:
             near = min(other, key=lambda b: abs(a.own_s - b.own_s - lag))
-            if abs(a.own_s - near.own_s - lag) < (a.interval_s + near.interval_s) / 2 and np.sign(a.change) == np.sign(
+            if abs(a.own_s - near.own_s - lag) < (a.gap_s + near.gap_s) / 2 and np.sign(a.change) == np.sign(
                 near.change
             ):
                 pairs.append((a, near))
@@ -128,7 +133,7 @@ def _match(i: int, j: int, one: Sequence[Event], other: Sequence[Event]) -> list
 
     tried = [(fitting(a.own_s - b.own_s), a.own_s - b.own_s) for a in one for b in other]
     best, lag = max(tried, key=lambda each: (len(each[0]), sum(abs(a.change * b.change) ** 0.5 for a, b in each[0])))
-    width = 2 * max(event.interval_s for event in (*one, *other))
+    width = 2 * max(event.gap_s for event in (*one, *other))
     second = max((len(pairs) for pairs, at in tried if abs(at - lag) > width), default=0)
     if not best:
         return []
@@ -147,7 +152,7 @@ def _match(i: int, j: int, one: Sequence[Event], other: Sequence[Event]) -> list
 def _tie(i: int, j: int, pairs: Sequence[tuple[Event, Event]], lag_s: float) -> Tie:
     """Return the tie of some changes whose offset is near ``lag_s``: mean and deviation of their likelihood."""
     step = min(min(a.interval_s, b.interval_s) for a, b in pairs) / _STEPS
-    reach = 2 * max(max(a.interval_s, b.interval_s) for a, b in pairs)
+    reach = 2 * max(max(a.gap_s, b.gap_s) for a, b in pairs)
     grid = np.arange(-reach, reach, step)
     total = np.zeros((len(_LENGTHS), len(_LENGTHS), 2 * len(grid)))
     for a, b in pairs:

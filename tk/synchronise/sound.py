@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -69,13 +70,34 @@ class Track:
 
 
 @dataclass(frozen=True)
+class Jump:
+    """A part of two tracks that fits at another offset than the rest: a part of one recording is missing, or out of
+    order.
+
+    Attributes:
+        apart_s: seconds by which the part of the second track fits the first later.
+        own_i, own_j: own times, seconds, of the beginning and the end of the part in both.
+    """
+
+    apart_s: float
+    own_i: tuple[float, float]
+    own_j: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class Heard:
-    """What the sound of a pair of cameras says: ties, none if it is not certain, and its certainty: how many windows
-    agree on the best offset, and on the second."""
+    """What the sound of a pair of cameras says.
+
+    Attributes:
+        ties: none if it is not certain.
+        windows, others: how many windows agree on the best offset, and on the second.
+        jump: a part at another offset; None without one.
+    """
 
     ties: tuple[Tie, ...]
     windows: int
     others: int
+    jump: Jump | None = None
 
 
 def read_track(recording: Recording) -> Track | None:
@@ -101,7 +123,7 @@ def read_track(recording: Recording) -> Track | None:
             except (av.error.FFmpegError, ValueError):  # damaged sound: what was before it is used
                 pass
             if start is not None and chunks:
-                parts.append((start + shift, np.concatenate(chunks).astype(np.float32)))
+                parts.append((start + shift + _edited_s(path), np.concatenate(chunks).astype(np.float32)))
     if not parts:
         return None
     begin = parts[0][0]
@@ -111,6 +133,23 @@ def read_track(recording: Recording) -> Track | None:
         first = max(round((start - begin) * RATE), 0)
         whole[first : first + len(samples)] = samples
     return Track(begin, whole)
+
+
+def _edited_s(path: Path) -> float:
+    """Return by how much later sound is, in the times of the images, than FFmpeg gives it, seconds: -0.04 to 0.
+
+    A file that was cut without encoding it again has an edit list, which begins between two images. FFmpeg counts time
+    from the first image that is shown; the sound begins where the list does.
+    """
+    times = []
+    for options in ({}, {"advanced_editlist": "0"}):
+        container, stream = open_video(path, options)
+        with container:
+            packets = (
+                float(packet.pts * stream.time_base) for packet in container.demux(stream) if packet.pts is not None
+            )
+            times.append(next(packets, 0.0))
+    return times[0] - times[1]
 
 
 def _and_end(frames: Iterator[Any]) -> Iterator[Any]:
@@ -154,15 +193,32 @@ def _compare(i: int, j: int, a: Track, b: Track, onsets_a: Float, onsets_b: Floa
         return Heard((), 0, 0)
     hits = found[0][1]
     others = max((_apart(each[1]) for each in found[1:] if each[1] and not _alike(each[1], hits)), default=0)
+    jump = _jump(a, b, hits, [each[1] for each in found[1:] if _apart(each[1]) > (1 if each[2] else 2)])
     lag = found[0][0]
     both_s = (min(len(a.samples), len(b.samples) + lag) - max(0, lag)) / RATE
     enough = min(_AGREEING, max(2, both_s // _WINDOW_S))  # all windows of a short recording
     sure = (_apart(hits) >= enough or found[0][2]) and _apart(hits) > 2 * others
     if not sure:
-        return Heard((), _apart(hits), others)
+        return Heard((), _apart(hits), others, jump)
     sigma = _sigma(hits)
     ties = tuple(Tie(i, j, a.start_s + at / RATE, b.start_s + (at - lag) / RATE, sigma, "sound") for at, lag, _ in hits)
-    return Heard(ties, _apart(hits), others)
+    return Heard(ties, _apart(hits), others, jump)
+
+
+def _jump(a: Track, b: Track, hits: Sequence[Hit], others: Sequence[Sequence[Hit]]) -> Jump | None:
+    """Return the part of two tracks in which another offset fits, before or after the windows of the best one; one of
+    ten windows may fit by chance."""
+    for other in others:
+        at, rest = ([hit[0] for hit in each] for each in (other, hits))
+        (begin, end), (first, last) = (np.quantile(each, [0.1, 0.9]) for each in (at, rest))
+        if _alike(other, hits) or not (begin > last or end < first):
+            continue
+        lag, best = (float(np.median([hit[1] for hit in each])) for each in (other, hits))
+        half = _WINDOW_S * RATE / 2
+        own_i = a.start_s + (min(at) - half) / RATE, a.start_s + (max(at) + half) / RATE
+        shift = b.start_s - a.start_s - lag / RATE
+        return Jump((lag - best) / RATE, own_i, (own_i[0] + shift, own_i[1] + shift))
+    return None
 
 
 def _apart(hits: Sequence[Hit]) -> int:
