@@ -14,7 +14,7 @@ from tk.model.cameras.camera import Camera
 from tk.synchronise.decide import Decision, decide, timecode_ties
 from tk.synchronise.faults import exchanged, other_speed_or_order, sound_in_other_order, still_parts
 from tk.synchronise.flash import compare_events
-from tk.synchronise.looks import LOOKED_S, Look, look_at
+from tk.synchronise.looks import LOOKED_S, Look, first_motion, look_at
 from tk.synchronise.person import Compared, align, compare_planes, compare_signals, signals_of
 from tk.synchronise.raw import Recording
 from tk.synchronise.sound import hear, read_track
@@ -159,6 +159,9 @@ def _look(
 ) -> list[Look]:
     """Return small images of each camera: where ties connect it to the first, of the part that both show."""
     progress("looking at the pictures")
+    first, last = recordings[0].span
+    if begin_s is None and last - first > LOOKED_S:
+        begin_s = first_motion(recordings[0])
     ahead = {0: 0.0}  # own time of the first camera minus that of another
     for _ in recordings:
         for tie in ties:
@@ -181,9 +184,12 @@ def _look(
         looks = list(threads.map(look, range(len(recordings))))
     for recording, each in zip(recordings, looks, strict=True):
         if each.constant:
+            first, last = float(each.times_s[0]), float(each.times_s[-1])
+            when = f"from {first:.0f} s to {last:.0f} s; give --from where the person moves"
+            partly = last - first < 0.9 * (recording.span[1] - recording.span[0])
             raise VideoError(
-                f"{recording.paths[0]}: {recording.where}: shows the same picture all the time; record it again, or "
-                "leave it out with --cameras"
+                f"{recording.paths[0]}: {recording.where}: shows the same picture "
+                f"{when if partly else 'all the time; record it again'}, or leave it out with --cameras"
             )
     return looks
 

@@ -26,6 +26,8 @@ Hit = tuple[float, float, float]
 RATE = 8000
 #: samples of a step of the onsets, 5 ms; borders of their bands, Hz
 _HOP, _BANDS = 40, (150, 500, 1000, 2000, 3800)
+#: seconds of a track that are filtered at once
+_BLOCK_S = 60
 #: candidates of the offset that are confirmed
 _CANDIDATES = 6
 #: seconds of a window, most windows, and how far the phase is searched about a candidate, without drift
@@ -169,15 +171,19 @@ def hear(tracks: Sequence[Track | None]) -> dict[tuple[int, int], Heard]:
 
 def _onsets(samples: Samples) -> Float:
     """Return (N, B) onsets: how much louder each band becomes in a step, as its logarithm."""
-    bands = []
     count = len(samples) // _HOP
-    for low, high in pairwise(_BANDS):
-        filtered = sosfiltfilt(butter(3, (low, high), "bandpass", fs=RATE, output="sos"), samples)
-        energy = (filtered[: count * _HOP].reshape(count, _HOP) ** 2).mean(axis=1)
-        level = np.log(energy + np.median(energy) / 4 + 1e-12)
-        rise = np.maximum(np.diff(level, prepend=level[:1]), 0.0)
-        bands.append(rise - rise.mean())
-    return np.stack(bands, axis=1)
+    energy = np.empty((count, len(_BANDS) - 1))
+    margin, block = RATE, _BLOCK_S * RATE  # a whole track of an hour takes a gigabyte
+    for k, band in enumerate(pairwise(_BANDS)):
+        filter_ = butter(3, band, "bandpass", fs=RATE, output="sos")
+        for first in range(0, count * _HOP, block):
+            last = min(first + block, count * _HOP)
+            before = min(first, margin)
+            filtered = sosfiltfilt(filter_, samples[first - before : last + margin])[before : before + last - first]
+            energy[first // _HOP : last // _HOP, k] = (filtered.reshape(-1, _HOP) ** 2).mean(axis=1)
+    level = np.log(energy + np.median(energy, axis=0) / 4 + 1e-12)
+    rise = np.maximum(np.diff(level, axis=0, prepend=level[:1]), 0.0)
+    return np.asarray(rise - rise.mean(axis=0))
 
 
 def _compare(i: int, j: int, a: Track, b: Track, onsets_a: Float, onsets_b: Float) -> Heard:
@@ -187,7 +193,7 @@ def _compare(i: int, j: int, a: Track, b: Track, onsets_a: Float, onsets_b: Floa
     found: list[tuple[int, list[Hit], bool]] = []
     for lag in [int(lags[k]) * _HOP for k in best] + _by_phase(a.samples, b.samples):
         if all(abs(lag - other) > 0.01 * RATE for other, _, _ in found):
-            found.append((lag, *_confirm(a.samples, b.samples, lag)))
+            found.append((lag, *_confirm(a.samples, b.samples, lag, (onsets_a, onsets_b))))
     found.sort(key=lambda each: (-len(each[1]), -sum(strength for _, _, strength in each[1])))
     if not found:
         return Heard((), 0, 0)
@@ -258,9 +264,10 @@ def _phase(a: Samples, b: Samples) -> tuple[Float, int]:
     return np.fft.irfft(cross, size), size
 
 
-def _confirm(a: Samples, b: Samples, lag: int) -> tuple[list[Hit], bool]:
+def _confirm(a: Samples, b: Samples, lag: int, onsets: tuple[Float, Float]) -> tuple[list[Hit], bool]:
     """Return the windows that confirm a lag, and whether one of them convinces alone. Windows that disagree with the
-    line through most of them are left out."""
+    line through most of them are left out. In long recordings, half of the windows are those with most onsets in both
+    tracks: the person may come late."""
     begin, end = max(0, lag), min(len(a), len(b) + lag)
     window = min(round(_WINDOW_S * RATE), end - begin)
     if window < SHORTEST_S * RATE:
@@ -269,7 +276,15 @@ def _confirm(a: Samples, b: Samples, lag: int) -> tuple[list[Hit], bool]:
     reach = _REACH_S + _MOST_DRIFT * (end - begin) / RATE
     hits: list[Hit] = []
     lone = False
-    for start in np.linspace(begin, end - window, count).round().astype(int).tolist():
+    starts = np.linspace(begin, end - window, count).round().astype(int)
+    if count == _WINDOWS:
+        loud = [np.maximum(each, 0).sum(axis=1) for each in onsets]
+        both = loud[0][begin // _HOP : end // _HOP], loud[1][(begin - lag) // _HOP : (end - lag) // _HOP]
+        steps = window // _HOP
+        length = min(map(len, both)) // steps
+        most = np.minimum(*(each[: length * steps].reshape(length, steps).sum(axis=1) for each in both)).argsort()
+        starts[1::2] = begin + most[::-1][: count // 2] * steps * _HOP
+    for start in np.unique(starts).tolist():
         x, y = a[start : start + window], b[max(start - lag, 0) : start - lag + window]
         if min(x.std(), y.std()) < _SILENCE / 10:
             continue
