@@ -193,9 +193,9 @@ def _ties(changes: Sequence[Mapping[int, Event]]) -> list[Tie]:
             for c in () if known is None else change:
                 offsets.setdefault(c, change[known].own_s + offsets[known] - change[c].own_s)  # type: ignore[index]
     every = [event for change in changes for event in change.values()]
-    step = min(event.interval_s for event in every) / _STEPS
+    step = float(min(event.interval_s for event in every)) / _STEPS
     reach = round(2 * max(event.gap_s for event in every) / step)
-    grid = np.arange(-2 * reach, 2 * reach + 1) * step
+    grid = np.arange(-2 * reach, 2 * reach + 1, dtype=np.float64) * step
     middle = [float(np.mean([event.own_s + offsets[c] for c, event in change.items()])) for change in changes]
     log = [
         {c: np.log(np.maximum(event.likelihood(at - offsets[c] + grid), 1e-12)) for c, event in change.items()}
