@@ -129,13 +129,17 @@ def _far_late(poses: dict[int, Pose]) -> dict[int, Pose]:
     return {n: poses[n - 7] if n - 7 in shared else pose for n, pose in poses.items() if n - 7 in shared or n >= 100}
 
 
-def _zoomed(image: np.ndarray, n: int) -> np.ndarray:
-    """A camera that zooms by a tenth after half of the places."""
-    if not 11 <= n < 100:
-        return image
-    h, w = image.shape[:2]
-    M = np.array([[1.1, 0, -0.05 * w], [0, 1.1, -0.05 * h]])
-    return np.asarray(cv2.warpAffine(image, M, (w, h), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+def _zoom(folder: Path, by: float, wanted: Callable[[int], bool]) -> None:
+    """cam2 has a longer focal length in some pictures; ``by``: factor."""
+
+    def change(image: np.ndarray, n: int) -> np.ndarray:
+        if not wanted(n):
+            return image
+        h, w = image.shape[:2]
+        M = np.array([[by, 0, (1 - by) * (w - 1) / 2], [0, by, (1 - by) * (h - 1) / 2]])
+        return np.asarray(cv2.warpAffine(image, M, (w, h), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+
+    _each(folder, "cam2", change)
 
 
 def _nothing(folder: Path) -> None:
@@ -177,7 +181,13 @@ FAULTS = (
     Fault("cam3 has the pictures of cam1", _copied, (), ("camera cam3", "cam1")),
     Fault("cam2 seven places late", lambda f: _rerender(f, "cam2", poses=_far_late), (), ("camera cam2",)),
     Fault("cam2 in reverse order", lambda f: _rerender(f, "cam2", poses=_reversed), (), ("camera cam2",)),
-    Fault("cam2 zooms in the middle", lambda f: _each(f, "cam2", _zoomed), (), ("camera cam2",)),
+    Fault("cam2 zooms by 10 % in the middle", lambda f: _zoom(f, 1.1, lambda n: 11 <= n < 100), (), ("camera cam2",)),
+    Fault("cam2 zooms by 3 % in the middle", lambda f: _zoom(f, 1.03, lambda n: 11 <= n < 100), (), ("camera cam2",)),
+    Fault(
+        "cam2 zooms by 3 % before the close places", lambda f: _zoom(f, 1.03, lambda n: n >= 100), (),
+        ("camera cam2", "zoomed"),
+    ),
+    Fault("cam2 zooms by 1 % in the middle", lambda f: _zoom(f, 1.01, lambda n: n >= 11), (), ("camera cam2",)),
     Fault("cam3 one picture", lambda f: _keep(f, "cam3", lambda n: n == 140), (), ("camera cam3", "too few")),
     Fault(
         "cam2 picture cut off",

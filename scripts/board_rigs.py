@@ -122,8 +122,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     board = make_board(
         options.board, None, {"charuco": 0.11, "chessboard": 0.08, "circles": 0.07, "aprilgrid": 0.09}[options.board]
     )
-    print("| rig | cameras | mm | ° | f, % | person, mm | expected, mm | px | verdict | s |")
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    print("| rig | cameras | mm | ° | f, % | person, mm | expected, mm | ratio | px | verdict | s |")
+    print("|---|---|---|---|---|---|---|---|---|---|---|")
     for name, recipe in (REPORT if options.report else DEVELOPMENT).items():
         if options.only in (None, name):
             with tempfile.TemporaryDirectory() as temporary:
@@ -132,8 +132,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             worst = max(one.rms_px for one in verdict.cameras)
             print(
                 f"| {name} | {len(recipe.cameras)} | {errors.place_mm:.2f} | {errors.turn_deg:.3f} | "
-                f"{errors.focal_percent:.3f} | {errors.person_mm:.2f} | {1000 * verdict.error_m:.2f} | {worst:.2f} | "
-                f"{verdict.word} | {seconds:.0f} |"
+                f"{errors.focal_percent:.3f} | {errors.person_mm:.3f} | {1000 * verdict.error_m:.3f} | "
+                f"{errors.person_mm / (1000 * verdict.error_m):.2f} | {worst:.2f} | "
+                f"{verdict.word} | {seconds:.0f} |",
+                flush=True,
             )
             for _, text in verdict.reasons:
                 print("  ", text)

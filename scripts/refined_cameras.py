@@ -39,12 +39,20 @@ TURN_DEG, MOVE_M = 0.25, 0.010
 GOAL_DEG, GOAL_M = 0.1, 0.005
 
 
-def disturbed(camera: Camera, rng: np.random.Generator) -> Camera:
-    """Return the camera turned by 0.25° and moved by 10 mm in random directions."""
+def disturbed(
+    camera: Camera, rng: np.random.Generator, turn_deg: float = TURN_DEG, move_m: float = MOVE_M, focal: float = 0.0
+) -> Camera:
+    """Return the camera turned by 0.25° and moved by 10 mm in random directions, with a focal length that is longer or
+    shorter by a share ``focal``."""
     axis, direction = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
-    turn = np.asarray(cv2.Rodrigues(np.radians(TURN_DEG) * axis)[0])
-    center = camera.center + MOVE_M * direction
-    return replace(camera, rotation=turn @ camera.rotation, translation=-turn @ camera.rotation @ center)
+    turn = np.asarray(cv2.Rodrigues(np.radians(turn_deg) * axis)[0])
+    center = camera.center + move_m * direction
+    matrix = camera.matrix.copy()
+    if focal:
+        matrix[:2, :2] *= 1 + focal * rng.choice([-1, 1])
+    return replace(
+        camera, matrix=matrix, rotation=turn @ camera.rotation, translation=-turn @ camera.rotation @ center
+    )  # fmt: skip
 
 
 def camera_errors(rig: Rig, true: Rig) -> str:

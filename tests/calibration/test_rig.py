@@ -12,7 +12,7 @@ from scripts.board_rigs import compare
 from scripts.synthetic.boards import make_rig, place_boards, true_world
 from tests.calibration.rigs import BOARD, POSES, QUICK, RECIPE, RIG, footages, keep, see
 from tk.calibration.boards import make_board
-from tk.calibration.bundle import View
+from tk.calibration.bundle import View, adjust
 from tk.calibration.footage import Footage
 from tk.calibration.intrinsics import Fitted, fit_lens
 from tk.calibration.lens import CHOICE, PINHOLE8, Model
@@ -20,6 +20,7 @@ from tk.calibration.poses import Pose, exp
 from tk.calibration.rig import Calibrated, Options, calibrate, rig_of
 from tk.calibration.verdict import Verdict, judge
 from tk.calibration.world import place_world
+from tk.calibration.zoom import largest_change
 from tk.errors import CalibrationError, ConfigError
 from tk.model.cameras.camera import Camera
 
@@ -142,6 +143,33 @@ def test_two_cameras_that_agree_show_which_one_is_wrong(good: tuple[Calibrated, 
     kept = tuple(view for view in done.views if all(view is not other for other in dropped))
     verdict = judge(replace(done, views=kept, dropped=dropped))
     assert [one.contradicting for one in verdict.cameras] == [len(dropped) if c == wrong else 0 for c in range(3)]
+
+
+@pytest.mark.parametrize("begin", [7, 100])
+def test_zoom_in_a_part_of_the_views_is_named(good: tuple[Calibrated, Verdict], begin: int) -> None:
+    """From the seventh place on, or in the views close to the camera only."""
+    done, _ = good
+    assert largest_change(done) is None
+    middle = np.array([RIG[1].width - 1, RIG[1].height - 1]) / 2
+    views = tuple(
+        replace(view, pixels=middle + 1.03 * (view.pixels - middle))
+        if view.camera == 1 and view.instant >= begin
+        else view
+        for view in done.views
+    )
+    zoomed = replace(done, views=views, solved=adjust(done.solved.state, views))
+    found = largest_change(zoomed)
+    assert found is not None and found[0] == 1 and abs(found[1] - 0.03) < 0.015
+    reasons = [text for _, text in judge(zoomed).reasons]
+    assert any("camera cam2: its focal length is" in text and "zoomed or focused" in text for text in reasons), reasons
+
+
+def test_zoom_since_an_earlier_calibration_is_named() -> None:
+    known = {camera.name: camera for camera in RIG}
+    matrix = RIG[1].matrix * [[1.03, 1, 1], [1, 1.03, 1], [1, 1, 1]]
+    _, verdict = run(footages(), replace(QUICK, intrinsics={**known, "cam2": replace(RIG[1], matrix=matrix)}))
+    assert verdict.level > 0
+    assert any("camera cam2: its focal length is" in text and "--intrinsics" in text for _, text in verdict.reasons)
 
 
 def test_mirrored_camera_is_refused() -> None:

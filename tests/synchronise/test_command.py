@@ -174,7 +174,7 @@ def only_one(folder: Path) -> None:
 
 def small(path: Path, shape: tuple[int, int] = (90, 160)) -> None:
     """Write three seconds of noise."""
-    grey = np.random.default_rng(len(path.name)).normal(100, 20, (30, *shape))
+    grey = np.random.default_rng([*path.name.encode()]).normal(100, 20, (30, *shape))
     write(path, Look(np.arange(30) / 10, np.clip(grey, 0, 255).astype(np.uint8)))
 
 
@@ -183,6 +183,28 @@ def chapter_gap(folder: Path) -> None:
     (folder / "b").mkdir()
     for number in (1, 3):
         small(folder / "b" / f"GX0{number}0012.MP4")
+
+
+def created(path: Path, time: str) -> None:
+    """Write the creation time of a video into it."""
+    part = path.with_name(f"part{path.suffix}")
+    with av.open(str(path)) as before, av.open(str(part), "w") as after:
+        after.metadata["creation_time"] = time
+        stream = after.add_stream_from_template(before.streams.video[0])
+        for packet in before.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                after.mux(packet)
+    part.rename(path)
+
+
+def chapters(folder: Path, *times: str) -> None:
+    """Write chapters of b that were created at these times."""
+    (folder / "b.mp4").unlink()
+    (folder / "b").mkdir()
+    for number, time in enumerate(times):
+        small(folder / "b" / f"CLIP{number}.MP4")
+        created(folder / "b" / f"CLIP{number}.MP4", f"2026-01-01T{time}Z")
 
 
 def only_sound(folder: Path) -> None:
@@ -208,7 +230,7 @@ HAND = ("--offsets", "a=0,b=2.2,c=1")
 FAULTS: dict[str, tuple[Callable[[Path], object], tuple[str, ...], str]] = {
     "other sound and pictures": (other_sound, (), "camera b: not sure when it was recorded: its sound is another one"),
     "contradiction": (contradicting, (), "camera b: not sure when it was recorded: its sound and its pictures"),
-    "mirrored": (mirrored, (), "camera b: not sure when it was recorded: its picture is mirrored"),
+    "mirrored": (mirrored, (), "camera b: its picture is mirrored"),
     "constant": (constant, (), "camera b: shows the same picture all the time"),
     "no sound, no motion": (no_sound_no_motion, (), "camera b: not sure when it was recorded: it has no sound"),
     "one second": (lambda folder: write(folder / "b.mp4", seen(1, 0, 1.0)), (), "camera b: is 1.0 s long"),
@@ -219,6 +241,12 @@ FAULTS: dict[str, tuple[Callable[[Path], object], tuple[str, ...], str]] = {
     "same file twice": (lambda f: shutil.copy(f / "a.mp4", f / "b.mp4"), (), "b.mp4: is the same file as"),
     "same name twice": (lambda f: shutil.copy(f / "a.mp4", f / "a.mov"), (), "another file has the same name"),
     "missing chapter": (chapter_gap, (), "GX030012.MP4: chapter 2 of this recording is missing"),
+    "chapters out of order": (
+        lambda f: chapters(f, "10:20:00", "10:00:00"), (), "CLIP1.MP4: camera b: was recorded 1200 s before CLIP0.MP4",
+    ),
+    "two recordings": (
+        lambda f: chapters(f, "10:00:00", "10:20:00"), (), "CLIP1.MP4: camera b: was created 1200 s after CLIP0.MP4",
+    ),
     "only sound": (only_sound, (), "b.mp4: holds sound, but no video"),
     "empty file": (lambda f: (f / "b.mp4").write_bytes(b""), (), "b.mp4: is an empty file"),
     "cut off": (cut_off, (), "b.mp4: is cut off"),

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 
 from tk.io.captures.referred import open_video_files
-from tk.synchronise.looks import pictures_at
-from tk.synchronise.raw import read_raw
+from tk.synchronise.looks import first_motion, pictures_at
+from tk.synchronise.raw import Recording, read_raw
 
 IMAGES, FPS = 130, 25
 FORMATS = [("a.avi", "mjpeg", "yuvj420p"), ("a.mts", "libx264", "yuv420p"), ("a.mkv", "libx264", "yuv420p"),
@@ -73,3 +75,19 @@ def test_a_capture_reads_the_images_that_it_jumps_to(tmp_path: Path, name: str, 
         reader.read(out)
         reader.close()
         assert number_of(out) == number
+
+
+def test_person_who_comes_late_is_found_in_the_key_images(tmp_path: Path) -> None:
+    grey = np.full((600, 48, 64), 90, np.uint8) + np.random.default_rng(0).integers(0, 4, (600, 48, 64), np.uint8)
+    grey[450:, 10:40, 20:30] = 200
+    path = tmp_path / "a.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=3, options={"preset": "ultrafast", "g": "9"})
+        stream.height, stream.width, stream.pix_fmt = 48, 64, "yuv420p"
+        for image in grey:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, "gray")))
+        container.mux(stream.encode())
+    recording = Recording("a", (path,), (0.0,), np.arange(600) / 3, 64, 48)
+    begin = first_motion(recording)
+    assert begin is not None and 120 <= begin <= 126  # half a minute before 150 s, to a key image
+    assert first_motion(replace(recording, times_s=np.arange(300) / 3)) is None  # nobody comes

@@ -12,7 +12,7 @@ from tk.synchronise import person
 from tk.synchronise.empty import find_empty
 from tk.synchronise.flash import compare_events
 from tk.synchronise.looks import Look
-from tk.synchronise.person import align, compare_planes, compare_signals
+from tk.synchronise.person import align, compare_planes, compare_signals, signals_of
 from tk.synchronise.run import is_mirrored
 from tk.synchronise.ties import Clocks, solve
 
@@ -35,8 +35,8 @@ def test_known_cameras_give_offsets_to_some_milliseconds(looks: list[Look]) -> N
 
 
 def test_unknown_cameras_give_offsets_to_a_frame(looks: list[Look], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(person, "_DOUBT", 0.9)  # 14 s of two balls are too little to be certain
-    aligned = align(compare_signals(looks), 3, [0.04, 0.04, 0.05], "person")
+    monkeypatch.setattr(person, "DOUBT", 0.9)  # 14 s of two balls are too little to be certain
+    aligned = align(compare_signals([signals_of(look) for look in looks]), 3, [0.04, 0.04, 0.05], "person")
     assert solve(3, aligned.ties).offsets_s == pytest.approx(STARTS, abs=0.05)
 
 
@@ -51,7 +51,10 @@ def test_two_groups_that_nothing_connects_are_not_certain_with_each_other() -> N
 def test_somebody_else_is_not_believed(looks: list[Look]) -> None:
     other = watch(ring(3)[1], [wander(7), wander(8)], 50.0, 14.0, 25.0)
     three = [looks[0], other, looks[2]]
-    for kind, pairs in (("cameras", compare_planes(three, ring(3))), ("person", compare_signals(three))):
+    for kind, pairs in (
+        ("cameras", compare_planes(three, ring(3))),
+        ("person", compare_signals([signals_of(look) for look in three])),
+    ):
         assert not align(pairs, 3, [0.04, 0.04, 0.05], kind).sure(1)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tk.synchronise.sound import RATE, Track, hear
+from tk.synchronise.sound import RATE, Track, _confirm, hear
 
 LENGTH_S = 16
 LATE_S = 2.345
@@ -51,6 +51,17 @@ def test_drift_shows_in_the_windows() -> None:
     ties = hear([microphone(sound, 1), microphone(slow, 2)])[0, 1].ties
     late = np.polyfit([tie.own_i for tie in ties], [tie.own_i - tie.own_j for tie in ties], 1)
     assert late[0] == pytest.approx(50e-6, abs=8e-6)
+
+
+def test_steps_late_in_a_long_recording_are_found() -> None:
+    """Windows at equal distances meet one or two of the seconds with steps."""
+    walked = steps(0, 18.0)
+    one = np.concatenate([np.zeros(220 * RATE), walked]).astype(np.float32)
+    one += 0.02 * np.random.default_rng(1).standard_normal(len(one)).astype(np.float32)
+    other = one[2 * RATE :]
+    loud = np.repeat([0.0, 1.0], [220 * RATE // 40, len(walked) // 40])[:, None]
+    hits, _ = _confirm(one, other, 2 * RATE, (loud, loud[2 * RATE // 40 :]))
+    assert sum(at > 220 * RATE for at, _, _ in hits) >= 4
 
 
 @pytest.mark.parametrize("kind", ["other", "hum", "noise"])

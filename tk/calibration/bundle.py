@@ -26,6 +26,8 @@ _CAUCHY = 2.385
 _MOST_ROUNDS, _ENOUGH, _ROUGH = 60, 1e-7, 1e-3
 #: time between the images of one instant, frames: synchronised videos are within half a frame of each other
 UNSYNCHRONISED = 0.29  # standard deviation of a uniform distribution of that width
+#: least share of a part's information about its focal length that the other unknowns do not explain
+_TOLD = 1e-6
 #: least noise of a point, pixels
 _LEAST_NOISE_PX = 0.02
 
@@ -73,6 +75,14 @@ class State:
 
 
 @dataclass(frozen=True)
+class Part:
+    """Views of a camera in which its focal length may be another one."""
+
+    camera: int
+    instants: frozenset[int]
+
+
+@dataclass(frozen=True)
 class Solved:
     """An adjusted estimate.
 
@@ -108,6 +118,28 @@ class Solved:
         values, vectors = np.linalg.eigh((inner + inner.T) / 2)
         wide = root @ (vectors * np.maximum(values, 1.0)) @ vectors.T @ root.T
         return np.asarray((wide + wide.T) / 2)
+
+
+def focal_changes(solved: Solved, views: Sequence[View], parts: Sequence[Part]) -> Float:
+    """Return (P, 2) by how much the logarithm of the focal length of each part's camera is larger in that part than in
+    its other views, and its standard deviation if errors are independent; NaN where the views do not tell.
+
+    It is one step of the adjustment with one more unknown.
+    """
+    problem = _Problem(views, solved.slices, sorted(solved.state.boards))
+    reduced = problem.equations(solved.state, solved.noise_px, parts).reduced()
+    S = solved.slices[-1].stop
+    scale = 1 / np.sqrt(np.diag(reduced.hessian)[:S])
+    inner = np.linalg.pinv(reduced.hessian[:S, :S] * np.outer(scale, scale), rcond=1e-14, hermitian=True)
+    inner = inner * np.outer(scale, scale)
+    found = np.full((len(parts), 2), np.nan)
+    for k in range(len(parts)):
+        across = inner @ reduced.hessian[:S, S + k]
+        own = float(reduced.hessian[S + k, S + k] - reduced.hessian[S + k, :S] @ across)
+        if own > _TOLD * reduced.hessian[S + k, S + k]:
+            scores = reduced.by_block[:, S + k] - reduced.by_block[:, :S] @ across
+            found[k] = scores.sum() / own, 1 / np.sqrt(own)
+    return found
 
 
 def adjust(start: State, views: Sequence[View], noise_px: float = 1.0) -> Solved:
@@ -231,9 +263,10 @@ class _Problem:
             total += 0.5 * float(g @ np.linalg.pinv(H) @ g)
         return total
 
-    def equations(self, state: State, noise_px: float) -> Equations:
-        """Return the normal equations at an estimate."""
-        equations = Equations(len(self.instants), 6, self.slices[-1].stop)
+    def equations(self, state: State, noise_px: float, parts: Sequence[Part] = ()) -> Equations:
+        """Return the normal equations at an estimate; the last shared unknowns are the changes of parts."""
+        shared = self.slices[-1].stop
+        equations = Equations(len(self.instants), 6, shared + len(parts))
         for stack in self.stacks:
             pixels, rows = self._projected(state, stack, True)
             errors = stack.pixels - pixels
@@ -244,7 +277,15 @@ class _Problem:
             for block, part in stack.views:
                 twice = slice(2 * part.start, 2 * part.stop)
                 flat = rows[part].reshape(-1, rows.shape[2])
-                equations.add(block, columns, flat, weight[twice], errors[part].ravel())
+                of = [
+                    k for k, each in enumerate(parts)
+                    if each.camera == stack.camera and self.instants[block] in each.instants
+                ]  # fmt: skip
+                by_focal = (flat[:, 12:14] @ state.lenses[stack.camera].values[:2])[:, None].repeat(len(of), axis=1)
+                extra = [slice(6 + shared + k, 7 + shared + k) for k in of]
+                equations.add(
+                    block, [*columns, *extra], np.hstack([flat, by_focal]), weight[twice], errors[part].ravel()
+                )
         diagonal = np.einsum("ss->s", equations.prior_hessian)
         for c, (lens, place) in enumerate(zip(state.lenses, self.slices, strict=True)):
             own = slice(place.start + 6, place.stop)

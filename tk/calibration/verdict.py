@@ -12,6 +12,7 @@ from tk.calibration.intrinsics import LEAST_RANGE
 from tk.calibration.lens import prior, project
 from tk.calibration.poses import cross
 from tk.calibration.rig import Calibrated
+from tk.calibration.zoom import largest_change
 from tk.errors import VolumeError
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import closest_to_axes, common_boxes, sample_box
@@ -31,7 +32,7 @@ CONTRADICTING = (0.15, 0.35)
 SHARED = (4, 2)
 #: share of the image with points: good. Outside of it the distortion is extrapolated.
 COVERED = 0.35
-#: relative standard deviation of a focal length: good, usable
+#: relative standard deviation of a focal length, and its change within a recording: good, usable
 FOCAL = (0.005, 0.02)
 #: share of the volume with a board nearby that two cameras see: good
 FILLED = 0.3
@@ -341,6 +342,14 @@ def _reasons(
                     one.contradicting / all_views, CONTRADICTING,
                     f"{name}: {one.contradicting} of {all_views} views contradict the others{_when(done, one.name)}",
                 )  # fmt: skip
+    if (change := largest_change(done)) is not None:
+        c, share, when = change
+        check(
+            abs(share), FOCAL,
+            f"camera {done.names[c]}: its focal length is {100 * abs(share):.1f} % "
+            f"{'larger' if share > 0 else 'smaller'} {when}: was it zoomed or focused? Fix both, and "
+            "record the board again",
+        )  # fmt: skip
     if several:
         shown = f"{1000 * error:.1f} mm" if np.isfinite(error) else "unknown"
         check(

@@ -97,7 +97,7 @@ def sync(raw: Path, output: Path, **given: Any) -> None:
                 done = by_hand(recordings, given["offsets"], given["begin"])
             else:
                 done = synchronise(recordings, cameras, methods, given["begin"], reporter.stage)
-            if done.decision.unsure:
+            if done.decision.unsure or done.decision.faulty:
                 _print(done, given["as_json"])
                 raise refused(recordings, done.decision)
             for line in done.decision.notes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,13 +24,13 @@ _SPAN_DIGITS = 3
 
 
 def common_span(recordings: Sequence[Recording], clocks: Clocks) -> tuple[float, float]:
-    """Return the common time, seconds, at which all cameras have begun, and that at which the first one ends.
+    """Return the common time, seconds, at which all cameras have begun, and that of the first last image.
 
     Raises:
         CaptureError: a camera has no time in common with the others.
     """
     begins = np.array([clocks.common(c, recording.span[0]) for c, recording in enumerate(recordings)])
-    ends = np.array([clocks.common(c, recording.span[1]) for c, recording in enumerate(recordings)])
+    ends = np.array([clocks.common(c, float(recording.times_s[-1])) for c, recording in enumerate(recordings)])
     begin, end = float(begins.max()), float(ends.min())
     if begin >= end:
         c = int(begins.argmax()) if (ends > begin).sum() < len(ends) / 2 + 1 else int(ends.argmin())
@@ -88,7 +89,9 @@ def write_capture(
     file = folder / "capture.toml"
     before = load_toml(file) if file.exists() else {}
     document: dict[str, object] = {key: value for key, value in before.items() if not isinstance(value, dict)}
-    document |= {"fps": _plain(fps), "from": round(span[0], _SPAN_DIGITS), "to": round(span[1], _SPAN_DIGITS)}
+    unit = 10**_SPAN_DIGITS  # rounded inwards: the first and the last frame have images
+    begin, end = math.ceil(span[0] * unit - 1e-6) / unit, math.floor(span[1] * unit + 1e-6) / unit
+    document |= {"fps": _plain(fps), "from": begin, "to": end}
     document |= {key: value for key, value in before.items() if isinstance(value, dict)}
     document.pop("background", None)
     if empty is not None:

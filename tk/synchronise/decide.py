@@ -35,12 +35,14 @@ class Decision:
         methods: the method of each camera.
         notes: lines for the user.
         unsure: why cameras are not synchronised, by camera; empty if all are.
+        faulty: what is wrong with the video of a camera, so that no offset helps, and the remedy.
     """
 
     clocks: Clocks
     methods: list[str]
     notes: list[str] = field(default_factory=list)
     unsure: dict[int, str] = field(default_factory=dict)
+    faulty: dict[int, str] = field(default_factory=dict)
 
 
 def decide(recordings: Sequence[Recording], ties: Sequence[Tie], reasons: dict[int, list[str]]) -> Decision:
@@ -97,7 +99,9 @@ def decide(recordings: Sequence[Recording], ties: Sequence[Tie], reasons: dict[i
 
 
 def refused(recordings: Sequence[Recording], decision: Decision) -> ClockError:
-    """Return the error about cameras that are not certain, one line."""
+    """Return the error about cameras that are faulty or not certain, one line."""
+    for c, text in decision.faulty.items():
+        return ClockError(f"{recordings[c].where}: {text}")
     first = min(decision.unsure, key=lambda c: (recordings[c].name == recordings[0].name, c))
     others = [recordings[c].name for c in decision.unsure if c != first and c != 0]
     hint = _creation_times(recordings, first)

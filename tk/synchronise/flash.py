@@ -1,14 +1,14 @@
 """Offsets from flashes and other sudden changes of the light that all cameras see.
 
-An image that saw the light for a part of its exposure gives the instant of the change, if the length of the exposure is
-known; two images with the light off and on give a range. The exposure, with the readout of a rolling shutter, is
-unknown, and the same at all changes of a camera: the likelihood of an offset is summed over all lengths. A time stamp
-counts as the middle of the exposure.
+The images about a change show the share of their exposures that saw the light, which gives the instant of the change if
+the length of the exposure is known. The length, with the readout of a rolling shutter, is unknown, and the same at all
+changes of a camera: the likelihood of an offset is summed over all lengths. A time stamp counts as the middle of the
+exposure.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, groupby
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.synchronise.looks import Look
-from tk.synchronise.ties import Tie
+from tk.synchronise.ties import Tie, connected_to
 
 Float = NDArray[np.float64]
 
@@ -28,12 +28,16 @@ _SHARE = 0.5
 _MOST_EVENTS = 12
 #: a lone change convinces if it is so many times the second largest of the camera
 _LONE = 3.0
+#: a change continues in the image before or after if that changes the same way by so many times the common change
+_CONTINUES = 3.0
 #: standard deviation of the share of an exposure that saw the light: rows that are read later, and the gamma of cameras
 _SHARE_SIGMA = 0.1
 #: seconds of changes that give one offset: clocks drift apart by 2 ms at most
 _TOGETHER_S = 30.0
-#: samples of an interval, and lengths of the exposure, in the likelihood
+#: samples of an interval, and lengths of the exposure as shares of a camera's interval, in the likelihood
 _STEPS, _LENGTHS = 60, np.linspace(0.1, 1.0, 10)
+#: samples that are left out, and those that count. With five times as many, offsets differ by less than 0.5 ms.
+_SKIPPED, _DRAWN = 100, 600
 
 
 @dataclass(frozen=True)
@@ -42,27 +46,30 @@ class Event:
 
     Attributes:
         own_s: its own time, seconds, within half of an interval.
-        interval_s: of the images, seconds.
+        interval_s: of the camera's images, seconds.
         change: grey levels.
-        off_s, on_s: own times of the last image before and the first one after the change.
-        lit: share of its exposure after the change, of an image at ``own_s``; None without such an image.
+        times_s: (M,) own times of the images about the change.
+        lit: (M,) share of their exposures after the change; 0 for the first, 1 for the last.
+        sigma: standard deviation of these shares.
     """
 
     own_s: float
     interval_s: float
     change: float
-    off_s: float
-    on_s: float
-    lit: float | None
+    times_s: Float
+    lit: Float
+    sigma: float
+
+    @property
+    def gap_s(self) -> float:
+        """Longest interval of the images about the change, seconds."""
+        return float(np.diff(self.times_s).max())
 
     def likelihood(self, times: Float) -> Float:
         """Return (E, N) for each length of the exposure, the likelihood that the light changed at own times (N,)."""
-        open_s = _LENGTHS[:, None] * self.interval_s
-        sigma = _SHARE_SIGMA * open_s
-        if self.lit is not None:
-            return np.exp(-0.5 * ((times - self.own_s - open_s * (0.5 - self.lit)) / sigma) ** 2)
-        outside = np.maximum(self.off_s + open_s / 2 - times, times - self.on_s + open_s / 2)
-        return np.exp(-0.5 * (np.maximum(outside, 0.0) / sigma) ** 2)
+        open_s = (_LENGTHS * self.interval_s)[:, None, None]
+        lit = np.clip(0.5 + (self.times_s - times[:, None]) / open_s, 0.0, 1.0)
+        return np.asarray(np.exp(-0.5 * (((self.lit - lit) / self.sigma) ** 2).sum(axis=2)))
 
 
 def find_events(look: Look) -> list[Event]:
@@ -76,89 +83,152 @@ def find_events(look: Look) -> list[Event]:
         if not large[k]:
             k += 1
             continue
-        last = k  # a change that two images share
-        if k + 1 < len(steps) and np.sign(steps[k + 1]) == np.sign(steps[k]) and abs(steps[k + 1]) > 3 * common:
-            last = k + 1
-        if (event := _event(look, k, last)) is not None:
+        first = last = k  # up to three steps: images that saw the light for a part of their exposure
+        along = steps * np.sign(steps[k]) > _CONTINUES * common
+        first -= k > 0 and bool(along[k - 1]) and not large[k - 1]
+        last += k + 1 < len(steps) and bool(along[k + 1])
+        if (event := _event(look, first, last, common)) is not None:
             events.append(event)
         k = last + 1
     return events
 
 
-def _event(look: Look, first: int, last: int) -> Event | None:
-    """Return the event of the changes ``first`` to ``last``; None if only a part of the image changes."""
+def _event(look: Look, first: int, last: int, common: float) -> Event | None:
+    """Return the event of the changes ``first`` to ``last``; None if only a part of the image changes. ``common``: the
+    common change, grey levels."""
     before, after = look.greys[first].astype(np.float32), look.greys[last + 1].astype(np.float32)
     change = float((after - before).mean())
-    if change > 0 and float((after - before > change / 2).mean()) < _SHARE:
+    if change == 0 or float(((after - before) * np.sign(change) > abs(change) / 2).mean()) < _SHARE:
         return None
-    if change < 0 and float((after - before < change / 2).mean()) < _SHARE:
-        return None
-    off, on = float(look.times_s[first]), float(look.times_s[last + 1])
-    interval = (on - off) / (last + 1 - first)
-    if last == first:  # the light changed between the exposures
-        return Event((off + on) / 2, interval, change, off, on, None)
-    lit = float((look.brightness[last] - look.brightness[first]) / change)
-    return Event(float(look.times_s[last]), interval, change, off, on, min(max(lit, 0.0), 1.0))
+    near = slice(first, last + 2)
+    times, lit = look.times_s[near], np.clip((look.brightness[near] - look.brightness[first]) / change, 0.0, 1.0)
+    partly = (lit * (1 - lit)).argmax()  # the image that saw most of the change
+    own = float(times[partly]) if last > first else float(times.mean())
+    sigma = float(np.hypot(_SHARE_SIGMA, common / change))
+    return Event(own, float(np.median(np.diff(look.times_s))), change, times, lit, sigma)
 
 
 def compare_events(looks: Sequence[Look]) -> list[Tie]:
     """Return ties of the cameras whose sudden changes of light fit together."""
     events = [find_events(look) for look in looks]
-    ties = []
+    links: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for i, j in combinations(range(len(looks)), 2):
-        if not 0 < len(events[i]) <= _MOST_EVENTS or not 0 < len(events[j]) <= _MOST_EVENTS:
-            continue
-        ties += _match(i, j, events[i], events[j])
+        if 0 < len(events[i]) <= _MOST_EVENTS and 0 < len(events[j]) <= _MOST_EVENTS:
+            links[i, j] = _match(events[i], events[j])
+    ties: list[Tie] = []
+    changes = _same_changes(links)
+    first = {k: min(events[c][n].own_s for c, n in change.items()) for k, change in enumerate(changes)}
+    for _, group in groupby(sorted(first, key=lambda k: first[k]), lambda k: first[k] // _TOGETHER_S):
+        ties += _ties([{c: events[c][n] for c, n in changes[k].items()} for k in group])
     return ties
 
 
-def _match(i: int, j: int, one: Sequence[Event], other: Sequence[Event]) -> list[Tie]:
-    """Return the ties of the lag at which most changes of two cameras fit; none if another lag is as good, or if a
-    single change does not stand out."""
+def _same_changes(links: Mapping[tuple[int, int], Sequence[tuple[int, int]]]) -> list[dict[int, int]]:
+    """Return for each change of the light the number of its event in each camera, from those that match in pairs."""
+    found: list[dict[int, int]] = []
+    for (i, j), matches in links.items():
+        for n, m in matches:
+            one = next((each for each in found if each.get(i) == n), None)
+            other = next((each for each in found if each.get(j) == m), None)
+            if one is None and other is None:
+                found.append({i: n, j: m})
+            elif one is None or other is None:
+                known = one if other is None else other
+                assert known is not None
+                known.setdefault(i, n)
+                known.setdefault(j, m)
+            elif one is not other:
+                found.remove(other)
+                one.update({c: k for c, k in other.items() if c not in one})
+    return found
 
-    def fitting(lag: float) -> list[tuple[Event, Event]]:
+
+def _match(one: Sequence[Event], other: Sequence[Event]) -> list[tuple[int, int]]:
+    """Return the events of two cameras at the lag at which most fit, by their numbers; none if another lag is as good,
+    or if a single change does not stand out."""
+
+    def fitting(lag: float) -> list[tuple[int, int]]:
         pairs = []
-        for a in one:
-            near = min(other, key=lambda b: abs(a.own_s - b.own_s - lag))
-            if abs(a.own_s - near.own_s - lag) < (a.interval_s + near.interval_s) / 2 and np.sign(a.change) == np.sign(
-                near.change
-            ):
-                pairs.append((a, near))
+        for n, a in enumerate(one):
+            m = min(range(len(other)), key=lambda m: abs(a.own_s - other[m].own_s - lag))
+            near = other[m]
+            same = np.sign(a.change) == np.sign(near.change)
+            if abs(a.own_s - near.own_s - lag) < (a.gap_s + near.gap_s) / 2 and same:
+                pairs.append((n, m))
         return pairs
 
+    def strength(pairs: Sequence[tuple[int, int]]) -> tuple[int, float]:
+        return len(pairs), sum(abs(one[n].change * other[m].change) ** 0.5 for n, m in pairs)
+
     tried = [(fitting(a.own_s - b.own_s), a.own_s - b.own_s) for a in one for b in other]
-    best, lag = max(tried, key=lambda each: (len(each[0]), sum(abs(a.change * b.change) ** 0.5 for a, b in each[0])))
-    width = 2 * max(event.interval_s for event in (*one, *other))
+    best, lag = max(tried, key=lambda each: strength(each[0]))
+    width = 2 * max(event.gap_s for event in (*one, *other))
     second = max((len(pairs) for pairs, at in tried if abs(at - lag) > width), default=0)
-    if not best:
+    if best and (len(best) <= second or len(best) < 2):
+        for event, events in ((one[best[0][0]], one), (other[best[0][1]], other)):
+            rest = [abs(each.change) for each in events if abs(each.own_s - event.own_s) > 0.5]
+            if abs(event.change) <= _LONE * max(rest, default=0.0):
+                return []
+    return best
+
+
+def _ties(changes: Sequence[Mapping[int, Event]]) -> list[Tie]:
+    """Return ties between the first and the other cameras that some changes of the light give together.
+
+    The unknowns are the instants of the changes, and each camera's offset and exposure. Samples of them are drawn in
+    turn from their distributions given all others (Gibbs sampling); the tie is mean and deviation of an offset.
+    """
+    members = [set(change) for change in changes]
+    cameras = sorted(set[int]().union(*members))
+    linked = connected_to(cameras[0], cameras[-1] + 1, [(min(m), c) for m in members for c in m if c != min(m)])
+    cameras = [c for c in cameras if linked[c]]
+    changes = [{c: change[c] for c in cameras if c in change} for change in changes if linked[min(change)]]
+    if len(cameras) < 2:
         return []
-    if len(best) <= second or len(best) < 2:
-        rises = [
-            sorted((abs(e.change) for e in events if abs(e.own_s - best[0][k].own_s) > 0.5), reverse=True)
-            for k, events in enumerate((one, other))
-        ]
-        lone = all(abs(best[0][k].change) > _LONE * (rest[0] if rest else 0.0) for k, rest in enumerate(rises))
-        if not lone:
-            return []
-    groups = groupby(best, lambda pair: pair[0].own_s // _TOGETHER_S)
-    return [_tie(i, j, list(group), lag) for _, group in groups]
+    # common times: of the first camera; the offsets of the others to begin with
+    offsets = {cameras[0]: 0.0}
+    while len(offsets) < len(cameras):
+        for change in changes:
+            known = next((c for c in change if c in offsets), None)
+            for c in () if known is None else change:
+                offsets.setdefault(c, change[known].own_s + offsets[known] - change[c].own_s)  # type: ignore[index]
+    every = [event for change in changes for event in change.values()]
+    step = float(min(event.interval_s for event in every)) / _STEPS
+    reach = round(2 * max(event.gap_s for event in every) / step)
+    grid = np.arange(-2 * reach, 2 * reach + 1, dtype=np.float64) * step
+    middle = [float(np.mean([event.own_s + offsets[c] for c, event in change.items()])) for change in changes]
+    log = [
+        {c: np.log(np.maximum(event.likelihood(at - offsets[c] + grid), 1e-12)) for c, event in change.items()}
+        for at, change in zip(middle, changes, strict=True)
+    ]
+    random = np.random.default_rng(0)
 
+    def draw(values: Float) -> int:
+        total = np.exp(values - values.max()).ravel().cumsum()
+        return int(np.searchsorted(total, random.random() * total[-1]))
 
-def _tie(i: int, j: int, pairs: Sequence[tuple[Event, Event]], lag_s: float) -> Tie:
-    """Return the tie of some changes whose offset is near ``lag_s``: mean and deviation of their likelihood."""
-    step = min(min(a.interval_s, b.interval_s) for a, b in pairs) / _STEPS
-    reach = 2 * max(max(a.interval_s, b.interval_s) for a, b in pairs)
-    grid = np.arange(-reach, reach, step)
-    total = np.zeros((len(_LENGTHS), len(_LENGTHS), 2 * len(grid)))
-    for a, b in pairs:
-        times = a.own_s + grid
-        one = np.fft.rfft(a.likelihood(times), 2 * len(grid))
-        other = np.fft.rfft(b.likelihood(times - lag_s), 2 * len(grid))
-        both = np.fft.irfft(one[:, None] * np.conj(other[None]), 2 * len(grid))
-        total += np.log(np.maximum(both, 1e-12))
-    density = np.exp(total - total.max()).sum(axis=(0, 1))
-    lags = step * ((np.arange(len(density)) + len(grid)) % len(density) - len(grid))
-    mean = float((density * lags).sum() / density.sum())
-    sigma = float(np.sqrt((density * (lags - mean) ** 2).sum() / density.sum() + step**2))
-    own = float(np.mean([a.own_s for a, _ in pairs]))
-    return Tie(i, j, own, own - lag_s - mean, sigma, "flash")
+    span = np.arange(-reach, reach + 1)
+    instant = [0] * len(changes)  # samples of the grid, from the middle
+    moved, length = dict.fromkeys(cameras, 0), dict.fromkeys(cameras, len(_LENGTHS) // 2)
+    sums = {c: np.zeros(2) for c in cameras}
+    for n in range(_SKIPPED + _DRAWN):
+        for k, tables in enumerate(log):
+            at = sum(table[length[c], 2 * reach + span - moved[c]] for c, table in tables.items())
+            instant[k] = int(span[draw(np.asarray(at))])
+        for c in cameras:
+            moves = span if c != cameras[0] else np.zeros(1, int)
+            seen = [(k, tables[c]) for k, tables in enumerate(log) if c in tables]
+            both = sum(table[:, 2 * reach + instant[k] - moves] for k, table in seen)
+            both = np.asarray(both)
+            length[c], at_move = divmod(draw(both), len(moves))
+            moved[c] = int(moves[at_move])
+            if n >= _SKIPPED:
+                density = np.exp(both - both.max()).sum(axis=0)
+                sums[c] += [density @ moves / density.sum(), density @ moves**2 / density.sum()]
+    ties = []
+    for c in cameras[1:]:
+        mean, square = sums[c] / _DRAWN
+        own = float(np.mean([change[c].own_s for change in changes if c in change]))
+        sigma = step * float(np.sqrt(max(square - mean**2, 0.0) + 1))
+        ties.append(Tie(cameras[0], c, own + offsets[c] + step * float(mean), own, sigma, "flash"))
+    return ties

@@ -28,6 +28,9 @@ LOOKED_S, _MOST_HZ = 180.0, 62.0
 #: grey levels by which a pixel must change from image to image, beyond the noise, to count as moving; and a level above
 #: which a change counts no more: reflections
 _MOVES, _MOST = 3.0, 40.0
+#: of a long recording, to find the person: seconds between key images; grey levels, and share of an image, that differ
+#: while somebody is there; seconds before that
+_KEYS_S, _DIFFERS, _SOMEBODY, _BEFORE_S = 5.0, 18.0, 0.003, 30.0
 #: grey levels by which coding changes the small images of one picture; the noise of a camera is more
 _CODING = 8
 
@@ -101,6 +104,23 @@ def look_at(recording: Recording, begin_s: float | None = None, length_s: float 
     return Look(np.array(times), np.stack(greys), turns)
 
 
+def first_motion(recording: Recording) -> float | None:
+    """Return an own time, seconds, half a minute before the first key image that differs from most; None if that is at
+    the start, or if none differs."""
+    times, greys = [], []
+    for time, image in _images(recording, recording.span[0], recording.span[1], keys_s=_KEYS_S):
+        times.append(time)
+        greys.append(image.reformat(SIDE_PX, round(SIDE_PX * image.height / image.width), format="gray").to_ndarray())
+    if len(greys) < 3:
+        return None
+    values = np.stack(greys).astype(np.float32)
+    change = values - np.median(values, axis=0)
+    change -= np.median(change, axis=(1, 2), keepdims=True)
+    differs = (np.abs(change) > _DIFFERS).mean(axis=(1, 2)) > _SOMEBODY
+    first = times[int(np.argmax(differs))] - _BEFORE_S if differs.any() else recording.span[0]
+    return first if first > recording.span[0] else None
+
+
 def pictures_at(recording: Recording, owns_s: list[float], height: int) -> list[Image]:
     """Return the images (height, w, 3) BGR nearest to own times, ascending."""
     wanted = [float(recording.times_s[np.abs(recording.times_s - own).argmin()]) for own in owns_s]
@@ -118,8 +138,9 @@ def pictures_at(recording: Recording, owns_s: list[float], height: int) -> list[
     return found
 
 
-def _images(recording: Recording, begin: float, end: float) -> Iterator[tuple[float, Any]]:
-    """Yield own times and decoded images from ``begin`` to ``end``; decoding starts at a key frame before."""
+def _images(recording: Recording, begin: float, end: float, keys_s: float | None = None) -> Iterator[tuple[float, Any]]:
+    """Yield own times and decoded images from ``begin`` to ``end``; decoding starts at a key frame before. ``keys_s``:
+    only key images, of which two lie so many seconds apart."""
     import av.error
 
     last = -np.inf
@@ -131,10 +152,10 @@ def _images(recording: Recording, begin: float, end: float) -> Iterator[tuple[fl
         seeks = begin - shift > recording.times_s[0] - shift + 1.0
         with ExitStack() as opened:
             try:
-                images = _decoded(opened, path, begin - shift if seeks else None)
+                images = _decoded(opened, path, begin - shift if seeks else None, keys_s)
                 first = next(images, None)
                 if seeks and (first is None or first.time is None or first.time + shift > begin):
-                    images = _decoded(opened, path, None)
+                    images = _decoded(opened, path, None, keys_s)
                     first = next(images, None)
                 for image in chain(() if first is None else (first,), images):
                     if image.time is None:
@@ -152,8 +173,9 @@ def _images(recording: Recording, begin: float, end: float) -> Iterator[tuple[fl
                 ) from None
 
 
-def _decoded(opened: ExitStack, path: Path, start_s: float | None) -> Iterator[Any]:
-    """Return the images of a file from a key frame about half a second before a time, or from its beginning."""
+def _decoded(opened: ExitStack, path: Path, start_s: float | None, keys_s: float | None) -> Iterator[Any]:
+    """Return the images of a file from a key frame about half a second before a time, or from its beginning.
+    ``keys_s``: see :func:`_images`."""
     import av.error
 
     container, stream = open_video(path)
@@ -162,4 +184,16 @@ def _decoded(opened: ExitStack, path: Path, start_s: float | None) -> Iterator[A
     if start_s is not None:
         with suppress(av.error.FFmpegError):  # no index
             container.seek(int((start_s - 0.5) / stream.time_base), stream=stream)
-    return decoded(container.demux(stream))
+    packets = container.demux(stream)
+    return decoded(packets if keys_s is None else _keys(packets, keys_s / float(stream.time_base)))
+
+
+def _keys(packets: Iterator[Any], apart: float) -> Iterator[Any]:
+    """Yield the packets of key images that lie so many ticks apart."""
+    last = -np.inf
+    for packet in packets:
+        if packet.is_keyframe and packet.dts is not None and packet.dts - last >= apart:
+            last = packet.dts
+            yield packet
+        elif packet.dts is None:
+            yield packet  # the end: images that wait for their place

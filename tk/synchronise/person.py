@@ -33,7 +33,7 @@ _PLANES, _BEYOND = 48, 0.01
 _LEAST_SINE = 0.2
 #: highest probability that another lag is the right one. Of 48 cameras whose video showed another recording, it was
 #: above 5e-4 for all; rhythms repeat, so that significances have more large values than normal deviates.
-_DOUBT = 1e-6
+DOUBT = 1e-6
 #: seconds over which signals without known cameras are compared with their surroundings
 _SLOW_S = 1.5
 
@@ -60,16 +60,20 @@ class Compared:
     start_j: float
     sine: float = 1.0
 
+    @property
+    def highest(self) -> float:
+        """Significance of the best lag, in units of what is common among all lags."""
+        return float(self.z.max(initial=0.0)) / common_deviation(self.z)
+
     def at(self, lag: int) -> float:
         """Return the significance of a lag; 0 where the recordings have too little in common."""
         k = lag - self.first
         return float(self.z[k]) if 0 <= k < len(self.z) and np.isfinite(self.z[k]) else 0.0
 
 
-def compare_signals(looks: Sequence[Look]) -> list[Compared]:
-    """Return every pair of cameras, compared by the amount of motion and its vertical part."""
-    signals = [_signals(look) for look in looks]
-    return [_compared(i, j, signals[i], signals[j]) for i, j in combinations(range(len(looks)), 2)]
+def compare_signals(signals: Sequence[tuple[float, Float]]) -> list[Compared]:
+    """Return every pair of cameras, compared by their signals: see :func:`signals_of`."""
+    return [_compared(i, j, signals[i], signals[j]) for i, j in combinations(range(len(signals)), 2)]
 
 
 def compare_planes(looks: Sequence[Look], cameras: Sequence[Camera], mirrored: int = -1) -> list[Compared]:
@@ -89,7 +93,7 @@ def compare_planes(looks: Sequence[Look], cameras: Sequence[Camera], mirrored: i
         return [found for found in threads.map(one, pairs) if found is not None]
 
 
-def _signals(look: Look) -> tuple[float, Float]:
+def signals_of(look: Look) -> tuple[float, Float]:
     """Return the own time of the first sample, and signals (N, 2) on the grid: the amount of motion, its vertical
     speed."""
     amount, vertical = [], []
@@ -236,7 +240,7 @@ def _certain(
     for key in sorted(_within(pairs, cameras), key=lambda key: -pairs[key].at(placed[key[0]] - placed[key[1]])):
         if not connected_to(key[0], max(cameras) + 1, tree)[key[1]]:
             tree.append(key)
-    worst, sides = _DOUBT, None
+    worst, sides = DOUBT, None
     for key in tree:
         side = cameras & set(np.flatnonzero(connected_to(key[0], max(cameras) + 1, [e for e in tree if e != key])))
         start, total = _total({c: placed[c] for c in side}, pairs, {c: placed[c] for c in cameras - side})
@@ -252,7 +256,7 @@ def _certain(
 def _doubt(total: Float, k: int, beside: int) -> float:
     """Return the probability that not lag ``k`` is the right one, nor one ``beside`` it. The likelihood of a lag is
     that of its significance as a normal deviate, in units of what is common among all lags."""
-    log = np.maximum(total / _common(total), 0.0) ** 2 / 2
+    log = np.maximum(total / common_deviation(total), 0.0) ** 2 / 2
     likelihood = np.exp(log - log.max())
     return float(1 - likelihood[max(k - beside, 0) : k + beside + 1].sum() / likelihood.sum())
 
@@ -308,7 +312,7 @@ def _peaks(z: Float, most: int) -> list[int]:
     return found
 
 
-def _common(significance: Float) -> float:
+def common_deviation(significance: Float) -> float:
     """Return the deviation of the significances of all lags that two recordings share; 1 without any."""
     shared = significance[np.isfinite(significance) & (significance != 0)]
     return 1.4826 * float(np.median(np.abs(shared))) + 1e-9 if len(shared) else 1.0
@@ -331,7 +335,7 @@ def _tie(pair: Compared, lag: int, intervals_s: Sequence[float], kind: str) -> T
         return None
     lag_s = (k + float(np.clip(-slope / (2 * curve), -half, half)) + pair.first) / GRID_HZ
     bend = -2 * curve / pair.r[k] * pair.z[k]
-    sigma = _common(pair.z) / float(np.sqrt(pair.z[k] * bend)) / GRID_HZ
+    sigma = common_deviation(pair.z) / float(np.sqrt(pair.z[k] * bend)) / GRID_HZ
     # the middle of the samples that both have
     count_j = 1 - pair.first
     count_i = len(pair.z) + 1 - count_j

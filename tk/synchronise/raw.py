@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,8 @@ Float = NDArray[np.float64]
 SHORTEST_S = 2.0
 #: GoPro's names: GX020012.MP4 is chapter 2 of recording 12; the chapter stands before the number
 _GOPRO = re.compile(r"G[HXSL](\d\d)(\d{4})$", re.IGNORECASE)
+#: seconds by which a chapter may be created later than the end of the one before: whole seconds, and writing files
+_CREATED_S = 5.0
 #: bytes at both ends by which files are compared
 _COMPARED = 1 << 16
 _TIMECODE = re.compile(r"(\d\d):(\d\d):(\d\d)([:;.])(\d+)$")
@@ -81,7 +84,7 @@ def read_raw(folder: Path, cameras: Sequence[str] | None = None) -> list[Recordi
 
     Raises:
         CaptureError: the folder has fewer than two cameras, a name is unknown, a file is there twice, or a chapter is
-            missing.
+            missing or out of order.
         VideoError: a file is no video, or cannot be decoded.
         ClockError: a video has no time stamps, or is too short.
     """
@@ -213,7 +216,9 @@ def _read(name: str, paths: tuple[Path, ...]) -> Recording:
         times.append(clip.times_s + shift)
     assert first is not None
     every = np.concatenate(times)
-    created, timecode = _marks(paths[0], float(np.median(np.diff(every))))
+    marks = [_marks(path, float(np.median(np.diff(every)))) for path in paths]
+    created, timecode = marks[0]
+    _check_order(name, paths, [mark[0] for mark in marks], [float(own[-1] - own[0]) for own in times])
     recording = Recording(
         name, paths, tuple(shifts), every, first.width, first.height, first.turn, created, timecode
     )  # fmt: skip
@@ -223,6 +228,33 @@ def _read(name: str, paths: tuple[Path, ...]) -> Recording:
             f"compared, record {SHORTEST_S:g} s or more"
         )
     return recording
+
+
+def _check_order(
+    name: str, paths: Sequence[Path], created: Sequence[datetime | None], lengths_s: Sequence[float]
+) -> None:
+    """Check the order of chapters by their creation times, which are those of their start or their end. Cameras that
+    write the same time into all chapters say nothing.
+
+    Raises:
+        CaptureError: a chapter was created before the one before it, or too late to continue it.
+    """
+    for k, (one, other) in enumerate(pairwise(created)):
+        if one is None or other is None or one == other or (one.tzinfo is None) != (other.tzinfo is None):
+            continue
+        apart_s = (other - one).total_seconds()
+        if apart_s < 0:
+            raise CaptureError(
+                f"{paths[k + 1]}: camera {name}: was recorded {-apart_s:.0f} s before {paths[k].name}, by their "
+                "creation times; name the chapters in their order"
+            )
+        late_s = apart_s - max(lengths_s[k], lengths_s[k + 1])
+        if late_s > _CREATED_S:
+            raise CaptureError(
+                f"{paths[k + 1]}: camera {name}: was created {apart_s:.0f} s after {paths[k].name}, which lasts "
+                f"{lengths_s[k]:.0f} s: a chapter between them is missing, or it is another recording; copy the "
+                "chapter, or keep the files of one recording"
+            )
 
 
 def _marks(path: Path, interval_s: float) -> tuple[datetime | None, float | None]:

@@ -12,18 +12,22 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError, VideoError
 from tk.model.cameras.camera import Camera
 from tk.synchronise.decide import Decision, decide, timecode_ties
+from tk.synchronise.faults import exchanged, other_speed_or_order, sound_in_other_order, still_parts
 from tk.synchronise.flash import compare_events
-from tk.synchronise.looks import LOOKED_S, Look, look_at
-from tk.synchronise.person import Compared, align, compare_planes, compare_signals
+from tk.synchronise.looks import LOOKED_S, Look, first_motion, look_at
+from tk.synchronise.person import Compared, align, compare_planes, compare_signals, signals_of
 from tk.synchronise.raw import Recording
 from tk.synchronise.sound import hear, read_track
-from tk.synchronise.ties import Clocks, Tie, connected_to
+from tk.synchronise.ties import Clocks, Tie, connected_to, solve
 from tk.synchronise.travel import without_travel_time
 
 Float = NDArray[np.float64]
 
 #: methods that find offsets; the user can choose
 METHODS = ("sound", "flash", "person", "timecode")
+#: by how much better the motion of a camera fits with its images mirrored, if they are: 1.4 and more; else 0.7 to 0.95
+_MIRRORED = 1.2
+_OTHER_SOUND = "its sound is another one"
 
 
 @dataclass
@@ -69,28 +73,33 @@ def synchronise(
     """
     count = len(recordings)
     ties: list[Tie] = []
+    linked = np.zeros(count, np.bool_)
+    faulty: dict[int, str] = {}
     reasons: dict[int, list[str]] = {c: [] for c in range(count)}
     if "sound" in methods:
         progress("comparing the sound")
         with ThreadPoolExecutor(2) as threads:
             tracks = list(threads.map(read_track, recordings))
         heard = hear(tracks)
+        faulty |= sound_in_other_order(heard)
         found = [tie for each in heard.values() for tie in each.ties]
         ties += found
-        linked = connected_to(0, count, [(tie.i, tie.j) for tie in found])
+        linked = max((connected_to(c, count, [(t.i, t.j) for t in found]) for c in range(count)), key=np.sum)
         for c in np.flatnonzero(~linked).tolist():
             silent = tracks[c] is None or tracks[c].silent
-            reasons[c].append("it has no sound" if silent else "its sound is another one")
+            reasons[c].append("it has no sound" if silent else _OTHER_SOUND)
     looks = _look(recordings, ties, begin_s, progress)
     if cameras and ties:
         ties = without_travel_time(ties, cameras, looks)
     if "flash" in methods:
         ties += compare_events(looks)
     mirrored: list[int] = []
+    progress("comparing what moves")
+    with ThreadPoolExecutor(2) as threads:
+        signals = list(threads.map(signals_of, looks))
     if "person" in methods:
-        progress("comparing what moves")
         kind = "cameras" if cameras else "person"
-        pairs = compare_planes(looks, cameras) if cameras else compare_signals(looks)
+        pairs = compare_planes(looks, cameras) if cameras else compare_signals(signals)
         intervals = [recording.interval_s for recording in recordings]
         aligned = align(pairs, count, intervals, kind)
         ties += aligned.ties
@@ -104,7 +113,22 @@ def synchronise(
         ties += timecode_ties(recordings)
     decision = decide(recordings, ties, reasons)
     for c in mirrored:
-        decision.unsure[c] = "its picture is mirrored, by the calibration; turn mirroring off in the camera"
+        faulty[c] = "its picture is mirrored, by the calibration; turn mirroring off in the camera"
+    clocks = decision.clocks
+    if not clocks.connected[1:].any():  # the first camera may be the wrong one: the others are compared
+        clocks = max((solve(count, ties, root) for root in range(count)), key=lambda each: int(each.connected.sum()))
+    faulty = other_speed_or_order(recordings, looks, signals, clocks) | faulty
+    if cameras and not faulty and (pair := exchanged(recordings, looks, cameras, decision.clocks)):
+        faulty[pair[0]] = (
+            f"its video and that of {recordings[pair[1]].name} look exchanged: what moves is then at one place for all "
+            "cameras; exchange the names of both"
+        )
+    decision.notes.extend(
+        f"{recordings[c].where}: {_OTHER_SOUND} than that of the others; {decision.methods[c]} alone gives its offset"
+        for c in range(count) if _OTHER_SOUND in reasons[c] and linked.sum() > 1 and decision.methods[c]
+    )  # fmt: skip
+    decision.notes.extend(still_parts(recordings, looks, clocks))
+    decision.faulty.update(faulty)
     return Synchronised(recordings, decision, looks, mirrored)
 
 
@@ -135,6 +159,9 @@ def _look(
 ) -> list[Look]:
     """Return small images of each camera: where ties connect it to the first, of the part that both show."""
     progress("looking at the pictures")
+    first, last = recordings[0].span
+    if begin_s is None and last - first > LOOKED_S:
+        begin_s = first_motion(recordings[0])
     ahead = {0: 0.0}  # own time of the first camera minus that of another
     for _ in recordings:
         for tie in ties:
@@ -157,9 +184,12 @@ def _look(
         looks = list(threads.map(look, range(len(recordings))))
     for recording, each in zip(recordings, looks, strict=True):
         if each.constant:
+            first, last = float(each.times_s[0]), float(each.times_s[-1])
+            when = f"from {first:.0f} s to {last:.0f} s; give --from where the person moves"
+            partly = last - first < 0.9 * (recording.span[1] - recording.span[0])
             raise VideoError(
-                f"{recording.paths[0]}: {recording.where}: shows the same picture all the time; record it again, or "
-                "leave it out with --cameras"
+                f"{recording.paths[0]}: {recording.where}: shows the same picture "
+                f"{when if partly else 'all the time; record it again'}, or leave it out with --cameras"
             )
     return looks
 
@@ -174,4 +204,7 @@ def is_mirrored(
     """Return whether a camera whose lag is uncertain has a certain one with its images mirrored."""
     others = [pair for pair in pairs if camera not in (pair.i, pair.j)]
     turned = compare_planes(looks, cameras, mirrored=camera)
+    own = [pair.highest for pair in pairs if camera in (pair.i, pair.j)]
+    if not turned or (own and np.mean([pair.highest for pair in turned]) < _MIRRORED * np.mean(own)):
+        return False
     return align([*others, *turned], len(cameras), intervals_s, "cameras").sure(camera)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,8 @@ Hit = tuple[float, float, float]
 RATE = 8000
 #: samples of a step of the onsets, 5 ms; borders of their bands, Hz
 _HOP, _BANDS = 40, (150, 500, 1000, 2000, 3800)
+#: seconds of a track that are filtered at once
+_BLOCK_S = 60
 #: candidates of the offset that are confirmed
 _CANDIDATES = 6
 #: seconds of a window, most windows, and how far the phase is searched about a candidate, without drift
@@ -69,13 +72,34 @@ class Track:
 
 
 @dataclass(frozen=True)
+class Jump:
+    """A part of two tracks that fits at another offset than the rest: a part of one recording is missing, or out of
+    order.
+
+    Attributes:
+        apart_s: seconds by which the part of the second track fits the first later.
+        own_i, own_j: own times, seconds, of the beginning and the end of the part in both.
+    """
+
+    apart_s: float
+    own_i: tuple[float, float]
+    own_j: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class Heard:
-    """What the sound of a pair of cameras says: ties, none if it is not certain, and its certainty: how many windows
-    agree on the best offset, and on the second."""
+    """What the sound of a pair of cameras says.
+
+    Attributes:
+        ties: none if it is not certain.
+        windows, others: how many windows agree on the best offset, and on the second.
+        jump: a part at another offset; None without one.
+    """
 
     ties: tuple[Tie, ...]
     windows: int
     others: int
+    jump: Jump | None = None
 
 
 def read_track(recording: Recording) -> Track | None:
@@ -101,7 +125,7 @@ def read_track(recording: Recording) -> Track | None:
             except (av.error.FFmpegError, ValueError):  # damaged sound: what was before it is used
                 pass
             if start is not None and chunks:
-                parts.append((start + shift, np.concatenate(chunks).astype(np.float32)))
+                parts.append((start + shift + _edited_s(path), np.concatenate(chunks).astype(np.float32)))
     if not parts:
         return None
     begin = parts[0][0]
@@ -111,6 +135,23 @@ def read_track(recording: Recording) -> Track | None:
         first = max(round((start - begin) * RATE), 0)
         whole[first : first + len(samples)] = samples
     return Track(begin, whole)
+
+
+def _edited_s(path: Path) -> float:
+    """Return by how much later sound is, in the times of the images, than FFmpeg gives it, seconds: -0.04 to 0.
+
+    A file that was cut without encoding it again has an edit list, which begins between two images. FFmpeg counts time
+    from the first image that is shown; the sound begins where the list does.
+    """
+    times = []
+    for options in ({}, {"advanced_editlist": "0"}):
+        container, stream = open_video(path, options)
+        with container:
+            packets = (
+                float(packet.pts * stream.time_base) for packet in container.demux(stream) if packet.pts is not None
+            )
+            times.append(next(packets, 0.0))
+    return times[0] - times[1]
 
 
 def _and_end(frames: Iterator[Any]) -> Iterator[Any]:
@@ -130,15 +171,19 @@ def hear(tracks: Sequence[Track | None]) -> dict[tuple[int, int], Heard]:
 
 def _onsets(samples: Samples) -> Float:
     """Return (N, B) onsets: how much louder each band becomes in a step, as its logarithm."""
-    bands = []
     count = len(samples) // _HOP
-    for low, high in pairwise(_BANDS):
-        filtered = sosfiltfilt(butter(3, (low, high), "bandpass", fs=RATE, output="sos"), samples)
-        energy = (filtered[: count * _HOP].reshape(count, _HOP) ** 2).mean(axis=1)
-        level = np.log(energy + np.median(energy) / 4 + 1e-12)
-        rise = np.maximum(np.diff(level, prepend=level[:1]), 0.0)
-        bands.append(rise - rise.mean())
-    return np.stack(bands, axis=1)
+    energy = np.empty((count, len(_BANDS) - 1))
+    margin, block = RATE, _BLOCK_S * RATE  # a whole track of an hour takes a gigabyte
+    for k, band in enumerate(pairwise(_BANDS)):
+        filter_ = butter(3, band, "bandpass", fs=RATE, output="sos")
+        for first in range(0, count * _HOP, block):
+            last = min(first + block, count * _HOP)
+            before = min(first, margin)
+            filtered = sosfiltfilt(filter_, samples[first - before : last + margin])[before : before + last - first]
+            energy[first // _HOP : last // _HOP, k] = (filtered.reshape(-1, _HOP) ** 2).mean(axis=1)
+    level = np.log(energy + np.median(energy, axis=0) / 4 + 1e-12)
+    rise = np.maximum(np.diff(level, axis=0, prepend=level[:1]), 0.0)
+    return np.asarray(rise - rise.mean(axis=0))
 
 
 def _compare(i: int, j: int, a: Track, b: Track, onsets_a: Float, onsets_b: Float) -> Heard:
@@ -148,21 +193,38 @@ def _compare(i: int, j: int, a: Track, b: Track, onsets_a: Float, onsets_b: Floa
     found: list[tuple[int, list[Hit], bool]] = []
     for lag in [int(lags[k]) * _HOP for k in best] + _by_phase(a.samples, b.samples):
         if all(abs(lag - other) > 0.01 * RATE for other, _, _ in found):
-            found.append((lag, *_confirm(a.samples, b.samples, lag)))
+            found.append((lag, *_confirm(a.samples, b.samples, lag, (onsets_a, onsets_b))))
     found.sort(key=lambda each: (-len(each[1]), -sum(strength for _, _, strength in each[1])))
     if not found:
         return Heard((), 0, 0)
     hits = found[0][1]
     others = max((_apart(each[1]) for each in found[1:] if each[1] and not _alike(each[1], hits)), default=0)
+    jump = _jump(a, b, hits, [each[1] for each in found[1:] if _apart(each[1]) > (1 if each[2] else 2)])
     lag = found[0][0]
     both_s = (min(len(a.samples), len(b.samples) + lag) - max(0, lag)) / RATE
     enough = min(_AGREEING, max(2, both_s // _WINDOW_S))  # all windows of a short recording
     sure = (_apart(hits) >= enough or found[0][2]) and _apart(hits) > 2 * others
     if not sure:
-        return Heard((), _apart(hits), others)
+        return Heard((), _apart(hits), others, jump)
     sigma = _sigma(hits)
     ties = tuple(Tie(i, j, a.start_s + at / RATE, b.start_s + (at - lag) / RATE, sigma, "sound") for at, lag, _ in hits)
-    return Heard(ties, _apart(hits), others)
+    return Heard(ties, _apart(hits), others, jump)
+
+
+def _jump(a: Track, b: Track, hits: Sequence[Hit], others: Sequence[Sequence[Hit]]) -> Jump | None:
+    """Return the part of two tracks in which another offset fits, before or after the windows of the best one; one of
+    ten windows may fit by chance."""
+    for other in others:
+        at, rest = ([hit[0] for hit in each] for each in (other, hits))
+        (begin, end), (first, last) = (np.quantile(each, [0.1, 0.9]) for each in (at, rest))
+        if _alike(other, hits) or not (begin > last or end < first):
+            continue
+        lag, best = (float(np.median([hit[1] for hit in each])) for each in (other, hits))
+        half = _WINDOW_S * RATE / 2
+        own_i = a.start_s + (min(at) - half) / RATE, a.start_s + (max(at) + half) / RATE
+        shift = b.start_s - a.start_s - lag / RATE
+        return Jump((lag - best) / RATE, own_i, (own_i[0] + shift, own_i[1] + shift))
+    return None
 
 
 def _apart(hits: Sequence[Hit]) -> int:
@@ -202,9 +264,10 @@ def _phase(a: Samples, b: Samples) -> tuple[Float, int]:
     return np.fft.irfft(cross, size), size
 
 
-def _confirm(a: Samples, b: Samples, lag: int) -> tuple[list[Hit], bool]:
+def _confirm(a: Samples, b: Samples, lag: int, onsets: tuple[Float, Float]) -> tuple[list[Hit], bool]:
     """Return the windows that confirm a lag, and whether one of them convinces alone. Windows that disagree with the
-    line through most of them are left out."""
+    line through most of them are left out. In long recordings, half of the windows are those with most onsets in both
+    tracks: the person may come late."""
     begin, end = max(0, lag), min(len(a), len(b) + lag)
     window = min(round(_WINDOW_S * RATE), end - begin)
     if window < SHORTEST_S * RATE:
@@ -213,7 +276,15 @@ def _confirm(a: Samples, b: Samples, lag: int) -> tuple[list[Hit], bool]:
     reach = _REACH_S + _MOST_DRIFT * (end - begin) / RATE
     hits: list[Hit] = []
     lone = False
-    for start in np.linspace(begin, end - window, count).round().astype(int).tolist():
+    starts = np.linspace(begin, end - window, count).round().astype(int)
+    if count == _WINDOWS:
+        loud = [np.maximum(each, 0).sum(axis=1) for each in onsets]
+        both = loud[0][begin // _HOP : end // _HOP], loud[1][(begin - lag) // _HOP : (end - lag) // _HOP]
+        steps = window // _HOP
+        length = min(map(len, both)) // steps
+        most = np.minimum(*(each[: length * steps].reshape(length, steps).sum(axis=1) for each in both)).argsort()
+        starts[1::2] = begin + most[::-1][: count // 2] * steps * _HOP
+    for start in np.unique(starts).tolist():
         x, y = a[start : start + window], b[max(start - lag, 0) : start - lag + window]
         if min(x.std(), y.std()) < _SILENCE / 10:
             continue

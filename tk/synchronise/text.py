@@ -20,7 +20,7 @@ def table(done: Synchronised) -> str:
     for c, recording in enumerate(done.recordings):
         sigma = float(clocks.offset_sigma_s[c])
         offset = "not sure"
-        if np.isfinite(clocks.offsets_s[c]) and c not in decision.unsure:
+        if np.isfinite(clocks.offsets_s[c]) and c not in (decision.unsure | decision.faulty):
             offset = f"{_no_minus_zero(clocks.offsets_s[c], 4):+.4f} s"
             if c and np.isfinite(sigma):
                 offset += f" ± {1000 * sigma:.1f} ms"
@@ -61,7 +61,7 @@ def to_dict(done: Synchronised) -> dict[str, Any]:
 
     cameras = {}
     for c, recording in enumerate(done.recordings):
-        sure = c not in decision.unsure
+        sure = c not in (decision.unsure | decision.faulty)
         rated = bool(clocks.rate_sigma[c] < KNOWN_RATE) and c > 0
         cameras[recording.name] = {
             "sure": sure,
@@ -72,7 +72,7 @@ def to_dict(done: Synchronised) -> dict[str, Any]:
             "method": decision.methods[c],
             "frames": len(recording.times_s),
             "dropped": recording.dropped,
-            "reason": decision.unsure.get(c),
+            "reason": decision.faulty.get(c, decision.unsure.get(c)),
         }
     return {"cameras": cameras, "notes": list(decision.notes)}
 

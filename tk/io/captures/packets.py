@@ -7,7 +7,7 @@ the two fields of an interlaced image as two packets. AVI files repeat an image 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -55,8 +55,9 @@ class Contents:
     pixels: str
 
 
-def open_video(path: Path) -> tuple[Any, Any]:
+def open_video(path: Path, options: Mapping[str, str] | None = None) -> tuple[Any, Any]:
     """Return PyAV's container of a file, which the caller closes, and its stream of images, decoded by one thread.
+    ``options``: of FFmpeg's demuxer.
 
     Raises:
         VideoError: the file is not there, or holds no video.
@@ -68,7 +69,7 @@ def open_video(path: Path) -> tuple[Any, Any]:
         raise VideoError(f"{path}: is not a file")
     name = c_name(path, VideoError)
     try:
-        container = av.open(name)
+        container = av.open(name, options=dict(options or {}))
     except (OSError, ValueError):  # base classes of PyAV's errors
         raise VideoError(f"{path}: {_why_unreadable(path)}") from None
     cover = av.stream.Disposition.attached_pic
