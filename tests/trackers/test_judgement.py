@@ -11,9 +11,11 @@ import pytest
 
 from tk.io.results.codec import decode, encode
 from tk.io.results.status import Status
+from tk.kernels.mask_values import OTHERS
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.skeleton import build_skeleton
+from tk.trackers.camera_monitor import touched_by_others
 from tk.trackers.judgement import (
     UNKNOWN_AFTER,
     FrameEvidence,
@@ -232,7 +234,18 @@ def test_every_reason_has_a_consequence_and_who_has_no_pose_has_no_sigma() -> No
     assert not any(then.sigma for then in CONSEQUENCES.values() if then.status in (Status.LOST, Status.SUSPECT))
 
 
-def test_one_poor_mask_is_no_evidence_against_a_camera() -> None:
-    """Missing and surplus area as of a wrong camera: a right one has such a mask now and then."""
-    right, wrong, _ = likelihoods(np.array([[9.0, 9.0]]), np.array([0.03]))[0]
-    assert 0.0 < wrong - right < 5.0
+def test_a_camera_in_which_people_touch_is_not_blamed_for_mixed_pixels() -> None:
+    """Missing and surplus area as of a wrong camera: pixels of two people may have been taken for one another's."""
+    excess, spread = np.array([[9.0, 9.0]] * 2), np.full(2, 0.03)
+    apart, touched = likelihoods(excess, spread, np.array([False, True]))
+    assert apart[1] - apart[0] > 20.0
+    assert touched[1] - touched[0] < 5.0
+    np.testing.assert_allclose(likelihoods(excess * 0.0, spread, True), likelihoods(excess * 0.0, spread), atol=0.01)
+
+
+def test_others_touch_the_person_where_their_pixels_are_neighbours() -> None:
+    masks = np.zeros((3, 8, 12), np.uint8)
+    masks[:, 2:6, 1:4] = 255
+    masks[0, 2:6, 4:7] = OTHERS
+    masks[1, 2:6, 6:9] = OTHERS
+    assert touched_by_others(masks).tolist() == [True, False, False]

@@ -160,6 +160,8 @@ class Plan:
             mask_sources=sources_of_masks(task.source) if tracker.reports_sigma else (),
             landmark_names=landmarks,
             reasons=MEANINGS,
+            judged=True,
+            deviation=tracker.reports_sigma,
             camera_states=STATE_MEANINGS if tracker.reports_sigma else (),
             segment_names=SEGMENTS if tracker.has_segments else (),
             feet=tracker.has_segments,

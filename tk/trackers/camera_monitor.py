@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +27,7 @@ from tk.model.cameras.landmark_agreement import evidence_for_cameras
 from tk.model.cues.ray_costs import residual_of
 from tk.model.masks.image_health import MOVED, HealthState, ImageHealth, described
 from tk.model.masks.mask_agreement import Agreement, MaskAgreement
+from tk.model.masks.regions import SQUARE3
 from tk.model.setup import Setup, Subject
 from tk.model.stateful import Stateful
 from tk.trackers.judgement import FAULTS, STATES, WRONG, Belief, Cameras, FrameJudge, JudgeState, likelihoods
@@ -202,10 +204,11 @@ class CameraMonitor(Stateful[MonitorState]):
             return estimate, used
         residual, left_out = estimate.residual, (cameras.states > 0) & ~cameras.unfit
         kept = (cameras.states == 0) & np.isfinite(residual[:, 0])
-        accused = self._accused(tracker, residual, kept)
+        touched = touched_by_others(tracker.screen.sample(frame.masks))
+        accused = self._accused(tracker, residual, kept, touched)
         if left_out.any() or accused is not None:
             residual = self._residual(tracker, frame, estimate)
-            accused = self._accused(tracker, residual, kept)
+            accused = self._accused(tracker, residual, kept, touched)
         if accused is not None:
             others = kept & (np.arange(len(kept)) != accused)
             if determine_depth(self._setup.rig.centers, estimate.joints.mean(axis=0), others):
@@ -214,20 +217,22 @@ class CameraMonitor(Stateful[MonitorState]):
                 second = tracker.step(fewer)
                 again = self._residual(tracker, frame, second)
                 # both poses by a baseline that has not learned this frame from the camera
-                with_it, without = (_likelihoods(tracker, found) for found in (residual, again))
+                with_it, without = (_likelihoods(tracker, found, touched) for found in (residual, again))
                 if cameras.judge(accused, others, with_it, without):
                     estimate, used, residual = second, fewer, again
                 else:
                     tracker.state = after
-        cameras.weigh(left_out & np.isfinite(residual[:, 0]), _likelihoods(tracker, residual))
+        cameras.weigh(left_out & np.isfinite(residual[:, 0]), _likelihoods(tracker, residual, touched))
         return estimate, used
 
-    def _accused(self, tracker: RegionTracker, residual: Float, kept: NDArray[np.bool_]) -> int | None:
+    def _accused(
+        self, tracker: RegionTracker, residual: Float, kept: NDArray[np.bool_], touched: NDArray[np.bool_]
+    ) -> int | None:
         """Return the camera that is to be judged, by a residual (C, 2); None if none is."""
         if np.count_nonzero(kept) < 3:
             return None
         best = likelihoods(np.zeros_like(residual), tracker.residuals.spread)
-        return self._cameras.accused(_likelihoods(tracker, residual), best, kept)
+        return self._cameras.accused(_likelihoods(tracker, residual, touched), best, kept)
 
     def _residual(self, tracker: RegionTracker, frame: Frame, estimate: Estimate) -> Float:
         """Return (C, 2) missing and surplus area at the estimate's pose, of excluded cameras, too. Missing area on
@@ -272,9 +277,18 @@ class CameraMonitor(Stateful[MonitorState]):
         return lines
 
 
-def _likelihoods(tracker: RegionTracker, residual: Float) -> Float:
+def _likelihoods(tracker: RegionTracker, residual: Float, touched: NDArray[np.bool_]) -> Float:
     """Return (C, 3) those of the cameras' states, from a residual (C, 2)."""
-    return likelihoods(tracker.residuals.excess(residual), tracker.residuals.spread)
+    return likelihoods(tracker.residuals.excess(residual), tracker.residuals.spread, touched)
+
+
+def touched_by_others(masks: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return (C,) whether pixels of others touch those of the person in masks (C, h, w)."""
+    others = masks == OTHERS
+    return np.array([
+        bool(mine.any() and (cv2.dilate(mine.view(np.uint8), SQUARE3) & (mask >= PERSON)).any())
+        for mine, mask in zip(others, masks, strict=True)
+    ])  # fmt: skip
 
 
 def _count(spans: dict[str, Span], key: str, index: int) -> None:

@@ -77,23 +77,26 @@ _LEAST = 1e-9
 # Wrong poses a second, whatever the cameras are.
 _LOSE_HZ = 0.3
 # Share of the frames in which a torn mask is whole; probability that a right mask shows something else, too; and that
-# the mask of a right camera is anything: in 2 % of the frames of the development captures a view has an outlier.
-_WHOLE, _FOREIGN, _POOR = 0.5, 1e-4, 0.02
+# pixels of people who touch each other in an image are taken for one another's.
+_WHOLE, _FOREIGN, _MIXED = 0.5, 1e-4, 0.01
 
 
-def likelihoods(excess: Float, spread: Float) -> Float:
+def likelihoods(excess: Float, spread: Float, touched: Bool | bool = False) -> Float:
     """Return (C, 3) logarithms of the likelihoods of the states right, wrong and torn; 0 if the excess is unknown.
 
     Args:
         excess: (C, 2) of missing and surplus area, in spreads.
         spread: (C,) of the areas, shares of the person's pixels: if a mask shows anything, all areas between 0 and 1
             are equally likely.
+        touched: (C,) whether another person's pixels touch this person's: the mask of a right camera may then miss
+            anything, and show anything.
     """
     normal = -(np.fmax(excess, 0.0) ** 2) / 2 - np.log(2 * np.pi) / 2
     anything = np.log(spread)
     surplus = np.logaddexp(np.log1p(-_FOREIGN) + normal[:, 1], np.log(_FOREIGN) + anything)
     torn = np.logaddexp(np.log(_WHOLE) + normal[:, 0], np.log1p(-_WHOLE) + anything)
-    right = np.logaddexp(np.log1p(-_POOR) + normal[:, 0] + surplus, np.log(_POOR) + 2 * anything)
+    mixed = np.log(_MIXED) + 2 * anything
+    right = np.where(touched, np.logaddexp(normal[:, 0] + surplus, mixed), normal[:, 0] + surplus)
     found = np.stack([right, 2 * anything, torn + surplus], axis=1)
     return np.where(np.isfinite(excess[:, :1]), found, 0.0)
 

@@ -141,7 +141,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
         """
         # without images: colours inside the silhouettes are a cue of the region tracker only
         blind = [Frame(f.index, f.images[:0], f.masks) for f in frames]
-        pose = self._finder.find(blind, subject)[0]
+        pose = self._finder.find(blind, subject)
         first = frames[0]
         self.hull.update(first.masks)
         surface = self.hull.surface(first.images)

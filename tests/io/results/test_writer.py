@@ -189,7 +189,7 @@ def test_undeclared_datasets_are_absent(path: Path) -> None:
     """Also those of pose and joints have no columns in a result that has only a hull."""
     plain = replace(
         META, sigma=False, residual_cameras=(), mask_sources=(),
-        reasons=(), camera_states=(), landmark_names=(), segment_names=(), feet=False,
+        reasons=(), judged=False, deviation=False, camera_states=(), landmark_names=(), segment_names=(), feet=False,
         angles=(), objective_kind="", pose_names=(), pose_units=(), joint_names=(), stages=(),
     )  # fmt: skip
     empty = {"pose": (), "joints/position": np.zeros((0, 3)), "iterations": ()}

@@ -88,6 +88,8 @@ class ResultMeta:
     landmark_names: tuple[str, ...] = ()  # names of the L landmarks; empty if no network sees landmarks
     mask_sources: tuple[str, ...] = ()  # meanings of the values of `/mask_source`; empty if no segmenter makes masks
     reasons: tuple[str, ...] = ()  # meanings of the values of `/evidence/reason`
+    judged: bool = False  # True if `/evidence/found` and `/evidence/origin` exist
+    deviation: bool = False  # True if `/evidence/sigma` exists
     camera_states: tuple[str, ...] = ()  # meanings of the values of `/evidence/camera`
     segment_names: tuple[str, ...] = ()  # names of the segments of `/segments/rotation`
     feet: bool = False  # True if `/feet/position` exists, the points `tk.model.body.joints.FOOT_POINTS`

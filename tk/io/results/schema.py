@@ -142,17 +142,17 @@ ROWS = (
     ),
     Dataset(
         "evidence/found", "F", "uint8", "the reason that the frame itself shows, without the others",
-        {"meaning": "reasons"}, field="found", optional="reasons",
+        {"meaning": "reasons"}, field="found", optional="judged",
     ),
     Dataset(
         "evidence/origin", "F", "uint8",
         "how the tracker came to the pose: 0, 1, 2 or 5 of `/status`, which follows from it and the reason",
-        {"meaning": _STATUS}, field="origin", optional="reasons", valid=(0, len(_STATUS) - 1),
+        {"meaning": _STATUS}, field="origin", optional="judged", valid=(0, len(_STATUS) - 1),
     ),
     Dataset(
         "evidence/sigma", "F J", "float64",
         "`/joints/sigma` as computed, also in frames whose reason says that it is not known, metres",
-        _NAMES, field="deviation", optional="sigma", valid=(0, MAX_DISTANCE_M),
+        _NAMES, field="deviation", optional="deviation", valid=(0, MAX_DISTANCE_M),
     ),
     Dataset(
         "evidence/camera", "F C", "uint8", "the cameras that were left out of the frame, and why; 0: used",
