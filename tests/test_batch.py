@@ -201,7 +201,8 @@ def test_death_of_a_worker_is_reported(tmp_path: Path) -> None:
 def test_error_without_offsets_is_not_given_for_a_still_person(tmp_path: Path) -> None:
     capture, out = folders(tmp_path / "walk", tmp_path / "out")
     (job,) = make_jobs([capture], out, RecordingOptions())
-    still = build_skeleton(BodyDimensions.from_stature(1.75)).joints(np.zeros(31))
+    skeleton = build_skeleton(BodyDimensions.from_stature(1.75))
+    still = skeleton.joints(np.zeros(len(skeleton.names)))
     bent = still + 0.0
     bent[[JOINTS.index(f"{name}_l") for name in ("elbow", "wrist", "knee", "ankle")], 0] += 0.3
 
