@@ -1,5 +1,5 @@
-"""Find a person in the opening frames from silhouettes, and landmarks where there are any: any pose, heading and stature
-(silhouette paper, section 4.6: "multiple different poses can be hypothesized and tested").
+"""Find a person in the opening frames from silhouettes, and from landmarks where there are any: any pose, heading and
+stature (silhouette paper, section 4.6: "multiple different poses can be hypothesized and tested").
 
 The person is searched for in several frames of the opening, and each pose found is tracked to both ends of the opening,
 until one trajectory has a low residual or two frames give the same trajectory. The whole opening decides which way the
