@@ -1,0 +1,155 @@
+"""The region tracker with landmarks, on silhouettes rendered from its own body."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.model.figures import draw_silhouettes
+from tests.model.landmarks import landmarks_of
+from tests.trackers.test_region import (
+    CLOSE_M,
+    MASKS,
+    POSES,
+    RIG,
+    SETTINGS,
+    SKELETON,
+    tracker_at,
+    with_arm,
+)
+from tests.trackers.walker import BODY, NAMES, errors, observe
+from tk.model.body.limb_candidates import exchanged, pairs, turned
+from tk.model.body.skeleton import JOINTS
+
+
+def seen_at(pose: np.ndarray, noise_m: float = 0.03) -> np.ndarray:
+    """The landmarks (1, C, L, 3) of a network that is some centimetres off."""
+    return landmarks_of(RIG, BODY, pose, noise_m)[None]
+
+
+@pytest.mark.parametrize("wrong", ["turned", "legs"])
+def test_landmarks_correct_left_and_right(wrong: str) -> None:
+    """Silhouettes alone keep a person who was tracked back to front, or with exchanged legs."""
+    pose = POSES[2]
+    tracker = tracker_at(pose)
+    mistaken = turned(pose, tracker.limbs) if wrong == "turned" else exchanged(pose, pairs(tracker.limbs))[1]
+    for landmarks, right in ((None, False), (seen_at(pose), True)):
+        tracker.start_at(mistaken)
+        found = tracker.step(replace(observe(MASKS[2], 0), landmarks=landmarks))
+        assert (errors(found, pose).max() < 2 * CLOSE_M) == right
+
+
+def test_landmarks_pull_a_limb_that_silhouettes_do_not_show() -> None:
+    """The forearm lies in front of the trunk in all images: only the landmarks show the hand."""
+    pose = with_arm(POSES[0], "l", (0.6, 0.1, -1.0), 60.0)
+    masks = draw_silhouettes(BODY, RIG, pose[None])[0]
+    tracker = tracker_at(pose, masks)
+    other = pose.copy()
+    other[NAMES.index("elbow_l_flexion")] += np.radians(15)
+    pull = {}
+    for name, landmarks in (("none", None), ("right", seen_at(pose, 0.0)), ("other", seen_at(other, 0.0))):
+        pyramid = tracker.pyramid(replace(observe(masks), landmarks=landmarks))
+        start = tracker.world.poses_in(pose[None])
+        pull[name] = tracker.settle(pyramid, start).states[0, NAMES.index("elbow_l_flexion")]
+    assert abs(pull["right"] - pose[NAMES.index("elbow_l_flexion")]) < np.radians(6)
+    assert pull["other"] > pull["right"] + np.radians(2)
+
+
+def test_landmarks_turn_the_head_and_not_the_trunk() -> None:
+    """The head stays turned in frames without landmarks; if there are none at all, it is straight."""
+    turn, yaw = NAMES.index("neck_roll"), NAMES.index("torso_yaw")
+    pose = POSES[0].copy()
+    pose[turn] = np.radians(45.0)
+    masks = draw_silhouettes(BODY, RIG, pose[None])[0]
+    tracker, blind = tracker_at(POSES[0], masks), tracker_at(POSES[0], masks)
+    found = [tracker.step(replace(observe(masks, i), landmarks=seen_at(pose, 0.01))).pose for i in range(2)]
+    assert found[-1][turn] == pytest.approx(pose[turn], abs=np.radians(8))
+    assert np.cos(found[-1][yaw] - pose[yaw]) > np.cos(np.radians(3))
+    held = [tracker.step(observe(masks, i)).pose[turn] for i in range(2, 4)]
+    np.testing.assert_allclose(held, found[-1][turn], atol=np.radians(3))
+    assert blind.step(observe(masks)).pose[turn] == 0.0
+
+
+def test_landmarks_that_nobody_is_seen_with_change_nothing() -> None:
+    unseen = np.full_like(seen_at(POSES[0]), np.nan)
+    elsewhere = POSES[0].copy()
+    elsewhere[:2] += 1.2
+    found = [
+        tracker_at(POSES[0]).step(replace(observe(MASKS[0], 0), landmarks=landmarks))
+        for landmarks in (None, unseen, seen_at(elsewhere), np.concatenate([unseen, unseen]))
+    ]
+    for other in found[1:]:
+        np.testing.assert_array_equal(other.pose, found[0].pose)
+        assert other.landmarks is None
+
+
+def test_landmarks_that_the_silhouettes_deny_enlarge_sigma_and_do_not_move_the_arms() -> None:
+    raised = with_arm(with_arm(POSES[0], "l", (0, 0.2, 1), 0.0), "r", (0, 0.2, 1), 0.0)
+    plain, denied = (
+        tracker_at(POSES[0]).step(replace(observe(MASKS[0], 0), landmarks=landmarks))
+        for landmarks in (seen_at(POSES[0]), seen_at(raised))
+    )
+    assert errors(denied, POSES[0]).max() < 2 * CLOSE_M
+    assert plain.sigma is not None and denied.sigma is not None
+    for wrist in ("wrist_l", "wrist_r"):
+        assert denied.sigma[JOINTS.index(wrist)] > 0.1 > plain.sigma[JOINTS.index(wrist)]
+
+
+def test_estimate_has_the_landmarks_of_its_person() -> None:
+    beside = POSES[0].copy()
+    beside[:2] += 0.6
+    people = np.concatenate([seen_at(beside), seen_at(POSES[0])])
+    found = tracker_at(POSES[0]).step(replace(observe(MASKS[0], 0), landmarks=people))
+    np.testing.assert_array_equal(found.landmarks, people[1])
+
+
+def test_second_pass_ignores_landmarks_of_excluded_cameras() -> None:
+    tracker, residual = tracker_at(POSES[0]), np.zeros((3, 3, 2))
+    residual[:, 2] = np.nan
+    wrong = np.stack([exchanged(pose, pairs(tracker.limbs))[1] for pose in POSES[:3]])
+    spoilt = np.stack([seen_at(pose)[0] for pose in POSES[:3]])
+    spoilt[:, 2, :, :2] += 20.0
+    plain = spoilt.copy()
+    plain[:, 2] = np.nan
+    lost = np.zeros(3, bool)
+    found, same = (
+        tracker.second_pass(MASKS[:3], wrong, lost, residual, None, landmarks, keep_body=True)[0]
+        for landmarks in (spoilt, plain)
+    )
+    np.testing.assert_array_equal(found, same)
+
+
+def test_second_pass_interpolates_the_turn_of_the_head_between_frames_with_landmarks() -> None:
+    turn, first = NAMES.index("neck_roll"), POSES.copy()
+    first[:, turn] = np.radians([0, 0, 0, 30, 30, 30])  # the first pass keeps the last turn
+    landmarks = np.full((6, *seen_at(POSES[0])[0].shape), np.nan)
+    for i in (1, 4):
+        landmarks[i] = seen_at(first[i], 0.01)[0]
+    tracker = tracker_at(POSES[0])
+    poses, _, _ = tracker.second_pass(MASKS, first, np.zeros(6, bool), np.zeros((6, 3, 2)), None, landmarks, True)
+    found = np.degrees(poses[:, turn])
+    np.testing.assert_allclose(found[[1, 4]], [0, 30], atol=8)
+    np.testing.assert_allclose(found, np.interp(range(6), [1, 4], found[[1, 4]]), atol=1e-9)
+
+
+def test_second_pass_corrects_legs_by_landmarks_of_all_cameras() -> None:
+    """Legs that are exchanged in all frames: no other frame shows them right."""
+    tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=0.1))
+    wrong = np.stack([exchanged(pose, pairs(tracker.limbs))[1] for pose in POSES])
+    landmarks = np.stack([seen_at(pose)[0] for pose in POSES])
+    found, _, _ = tracker.second_pass(MASKS, wrong, np.zeros(6, bool), np.zeros((6, 3, 2)), None, landmarks, True)
+    off = np.linalg.norm(SKELETON.joints(found) - SKELETON.joints(POSES), axis=2).max(axis=1)
+    assert (off < 3 * CLOSE_M).all()
+
+
+def test_landmarks_decide_about_the_opposite_heading() -> None:
+    """The masks show the person in both headings."""
+    tracker = tracker_at(POSES[0])
+    turned = tracker.turned_pose(POSES[0])
+    masks = draw_silhouettes(BODY, RIG, np.stack([POSES[0], turned])).max(axis=0)
+    assert len(tracker.headings([masks], POSES[:1], None, None)) == 2
+    assert tracker.headings([masks], POSES[:1], None, seen_at(POSES[0])) == ()
+    both = [tracker.cost([masks], pose[None], seen_at(turned)) for pose in (POSES[0], turned)]
+    assert both[1] < both[0] - 10.0
