@@ -510,3 +510,22 @@ def test_legs_that_took_each_other_s_place_are_found_by_the_routine_search() -> 
     off = [errors(step, pose)[moved] for step in steps]
     assert off[0].max() > 0.2  # a descent alone does not exchange them
     assert off[-1].max() < CLOSE_M
+
+
+# --- the spread over the modes of a limb ------------------------------------------------------------------------------
+
+
+def test_spread_counts_each_mode_once_and_the_pose_that_was_left() -> None:
+    raised = with_arm(POSES[0], "l", (0.0, 0.3, 1.0), 10.0)
+    tracker = tracker_at(POSES[0])
+    arm = next(limb for limb in tracker.limbs if limb.name == "arm_l")
+    one, twice = (
+        [limbs.Modes(arm, np.array([raised] * count), np.full(count, np.log(3.0)))] for count in (1, 2)
+    )  # its probability is 1/4
+    square = ((SKELETON.joints(raised) - SKELETON.joints(POSES[0])) ** 2).sum(axis=1) / 3
+    assert np.sqrt(square[JOINTS.index("wrist_l")]) > 0.3
+    for found in (one, twice):
+        np.testing.assert_allclose(limbs.spread(SKELETON, POSES[0], POSES[0], found), square / 4)
+    # if it was chosen nevertheless, the pose before has a probability of 3/4
+    np.testing.assert_allclose(limbs.spread(SKELETON, raised, POSES[0], one), 0.75 * square)
+    assert not limbs.spread(SKELETON, POSES[0], POSES[0], []).any()

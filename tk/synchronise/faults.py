@@ -216,7 +216,7 @@ def exchanged(
 ) -> tuple[int, int] | None:
     """Return two cameras whose videos are exchanged: only then do the rays to what moves meet. None if no two are.
 
-    Three cameras or more are needed: two rays nearly meet in many ways.
+    Three cameras or more are needed: two rays often nearly meet.
     """
     count = len(looks)
     if count < 3 or not clocks.connected.all():

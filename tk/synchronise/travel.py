@@ -18,7 +18,7 @@ Float = NDArray[np.float64]
 
 #: speed of sound in air, m/s
 SOUND_M_S = 343.0
-#: seconds about a sound in which its source is looked for: several steps
+#: seconds about a sound in which its source is searched for: several steps
 _ABOUT_S = 2.0
 
 

@@ -81,7 +81,7 @@ class MonitorState:
     """What is known of C cameras and of the person.
 
     Attributes:
-        cameras: what is believed of them.
+        cameras: the probability of each of their states.
         spans: of exclusion, by "camera/state".
         doubted: (C,) see :class:`CameraMonitor`.
         opening_reasons: why cameras are excluded from the opening on.

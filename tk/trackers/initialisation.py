@@ -129,11 +129,13 @@ def _find(finder: ContourFinder, seen: Seen) -> tuple[float, Float]:
     skeleton = finder.body.skeleton
     found = np.concatenate([anywhere.propose(finder, seen), landmarks.propose(finder, seen)])
     both = [opposite.propose(finder, seen, pose, range(finder.solver.scales)[::-1]) for pose in found[:OPPOSITE]]
-    found = different(skeleton, np.concatenate([found, *both]), SAME_START_M)
+    found = np.concatenate([found, *both])
+    found = found[different(skeleton, found, SAME_START_M)]
     poses = np.array([_searched(finder, seen, pose) for pose in found])
     cost = seen.evidence.score(finder.body, poses)
     order = np.argsort(cost, kind="stable")
-    kept = different(skeleton, poses[order[cost[order] < cost.min() + DROPPED]], SAME_START_M)
+    kept = poses[order[cost[order] < cost.min() + DROPPED]]
+    kept = kept[different(skeleton, kept, SAME_START_M)]
     return float(finder.mean_residual(seen.pyramid, kept[:1], seen.frame.uncertain)[0]), kept
 
 

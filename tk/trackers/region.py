@@ -3,8 +3,10 @@
 One frame:
 
     masks → contours from the prediction: silhouette edges, and colour differences inside the silhouette
-          → is the residual high, or a limb misplaced?  ── no ─► pose, σ
-          → yes: candidates for all limbs, screened in one launch each, the best ones refined
+          → are there landmarks? Their pose is a hypothesis
+          → is the residual high, a limb misplaced, or a search due?  ── no ─► pose, σ
+          → yes: candidates for all limbs, screened in one launch each, the best ones refined; exchanged limbs, and the
+            opposite heading
           → the best few are tracked for some frames; the one with the lowest cost is the pose
           → the colours of the parts are learned
 
@@ -278,7 +280,7 @@ class RegionTracker(ContourTracker[RegionState]):
         if self._choose(seen, *proposed):
             look = self._look(seen)
         if searched:
-            self._spread = limbs.spread(self.body.skeleton, self._best.pose, found)
+            self._spread = limbs.spread(self.body.skeleton, self._best.pose, best, found)
         watch.lap("search")
         pose, error = self._best.pose, float(np.nanmean(look.error))
         reason = Match(

@@ -52,7 +52,7 @@ def propose(finder: ContourFinder, seen: Seen, pose: Float | None = None) -> Flo
         poses = finder.settle(pyramid, poses, levels).states
         order = np.argsort(seen.evidence.score(finder.body, poses), kind="stable")
         poses = poses[order[: -(-len(poses) // share)]]
-    return different(skeleton, poses, SAME_START_M)[:FINALISTS]
+    return np.asarray(poses[different(skeleton, poses, SAME_START_M)[:FINALISTS]])
 
 
 def centroid(rig: Rig, pyramid: Pyramid, index: int) -> Float:

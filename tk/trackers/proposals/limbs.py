@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tk.kernels.raycast import Cast
 from tk.model.body.limb_candidates import Limb
 from tk.model.body.skeleton import JOINTS, Skeleton
-from tk.trackers.hypotheses import DROPPED, PROPOSED, SAME_POSE_M
+from tk.trackers.hypotheses import DROPPED, PROPOSED, SAME_POSE_M, different
 
 if TYPE_CHECKING:
     from tk.trackers.contour_finder import ContourFinder, Seen
@@ -102,14 +102,23 @@ def propose(finder: ContourFinder, seen: Seen, pose: Float, found: Sequence[Mode
     return poses[np.argsort(seen.evidence.score(finder.body, poses), kind="stable")[:FINISHED]] if result else poses
 
 
-def spread(skeleton: Skeleton, pose: Float, found: Sequence[Modes]) -> Float:
+def spread(skeleton: Skeleton, pose: Float, before: Float, found: Sequence[Modes]) -> Float:
     """Return (J,) variance of the joints' positions along an axis, metres², about a pose (D,), over the modes of each
-    limb."""
+    limb.
+
+    Args:
+        skeleton: of D degrees of freedom.
+        pose: the pose that was chosen.
+        before: (D,) the pose for which the modes were found, one of them.
+        found: candidates that converge to the same pose count once.
+    """
     joints, variance = skeleton.joints(pose), np.zeros(len(JOINTS))
     for one in found:
-        poses = np.repeat(pose[None], len(one.poses), axis=0)
-        poses[:, one.limb.dofs] = one.poses[:, one.limb.dofs]
-        weight = np.exp(-one.cost)
-        away = ((skeleton.joints(poses) - joints) ** 2).sum(axis=-1) / 3
-        variance += weight @ away / (1.0 + weight.sum())
+        limb = np.concatenate([before[None], one.poses])[:, one.limb.dofs]
+        poses = np.repeat(pose[None], len(limb), axis=0)
+        poses[:, one.limb.dofs] = limb
+        kept = different(skeleton, poses, SAME_POSE_M)
+        weight = np.exp(-np.concatenate([[0.0], one.cost])[kept])
+        away = ((skeleton.joints(poses[kept]) - joints) ** 2).sum(axis=-1) / 3
+        variance += weight @ away / weight.sum()
     return variance
