@@ -11,13 +11,15 @@ import pytest
 
 from tk.io.results.codec import decode, encode
 from tk.io.results.status import Status
-from tk.kernels.mask_values import OTHERS
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.skeleton import build_skeleton
-from tk.trackers.camera_monitor import touched_by_others
 from tk.trackers.judgement import (
+    STATES,
+    TORN,
     UNKNOWN_AFTER,
+    WRONG,
+    Cameras,
     FrameEvidence,
     FrameJudge,
     JudgeState,
@@ -234,18 +236,65 @@ def test_every_reason_has_a_consequence_and_who_has_no_pose_has_no_sigma() -> No
     assert not any(then.sigma for then in CONSEQUENCES.values() if then.status in (Status.LOST, Status.SUSPECT))
 
 
-def test_a_camera_in_which_people_touch_is_not_blamed_for_mixed_pixels() -> None:
-    """Missing and surplus area as of a wrong camera: pixels of two people may have been taken for one another's."""
-    excess, spread = np.array([[9.0, 9.0]] * 2), np.full(2, 0.03)
-    apart, touched = likelihoods(excess, spread, np.array([False, True]))
-    assert apart[1] - apart[0] > 20.0
-    assert touched[1] - touched[0] < 5.0
-    np.testing.assert_allclose(likelihoods(excess * 0.0, spread, True), likelihoods(excess * 0.0, spread), atol=0.01)
+CAMERAS, SPREAD = 4, np.full(4, 0.03)
+EVERYBODY = np.ones(CAMERAS, np.bool_)
 
 
-def test_others_touch_the_person_where_their_pixels_are_neighbours() -> None:
-    masks = np.zeros((3, 8, 12), np.uint8)
-    masks[:, 2:6, 1:4] = 255
-    masks[0, 2:6, 4:7] = OTHERS
-    masks[1, 2:6, 6:9] = OTHERS
-    assert touched_by_others(masks).tolist() == [True, False, False]
+def areas(missing: float, surplus: float, others: float = 0.0) -> np.ndarray:
+    """Return (C, 3) the likelihoods of camera 1's areas, in spreads; those of the others have this excess."""
+    excess = np.full((CAMERAS, 2), others)
+    excess[1] = missing, surplus
+    return likelihoods(excess, SPREAD)
+
+
+def follow(missing: float, surplus: float, others: float, frames: int = 30) -> tuple[list[str | None], int]:
+    """Judge camera 1 in each frame: areas with it, and the excess of the others that vanishes without it. Return the
+    faults, and its state in the end."""
+    cameras, faults = Cameras(CAMERAS, 15.0), []
+    best, rest = areas(0.0, 0.0), EVERYBODY & (np.arange(CAMERAS) != 1)
+    for _ in range(frames):
+        with_it, without = areas(missing, surplus, others), areas(missing, surplus)
+        if cameras.accused(with_it, best, EVERYBODY) == 1:
+            faults.append(cameras.judge(1, rest, with_it, without))
+        else:
+            faults.append(None)
+            cameras.weigh(EVERYBODY, with_it)
+        if faults[-1] == WRONG:
+            break
+    return faults, int(cameras.states[1])
+
+
+@pytest.mark.parametrize(("missing", "surplus"), [(0.0, 8.0), (10.0, 0.0), (4.0, 4.0)])
+def test_a_poor_mask_is_used_while_the_others_fit_as_well_with_it(missing: float, surplus: float) -> None:
+    """Something that the person carries hides a part of the body, or is taken for one."""
+    faults, state = follow(missing, surplus, 0.0)
+    assert not any(faults) and state == 0
+
+
+def test_a_camera_is_wrong_if_the_others_fit_better_without_it() -> None:
+    faults, state = follow(10.0, 10.0, 3.0)
+    assert (faults, STATES[state]) == ([WRONG], WRONG)
+    # a little better in each of several frames
+    faults, state = follow(8.0, 8.0, 0.5)
+    assert faults[0] is None and STATES[state] == WRONG
+
+
+def test_a_torn_mask_is_left_out_in_its_frames_only() -> None:
+    cameras, rest = Cameras(CAMERAS, 15.0), EVERYBODY & (np.arange(CAMERAS) != 1)
+    assert cameras.judge(1, rest, areas(7.0, 0.0, 2.0), areas(7.0, 0.0)) == TORN
+    assert cameras.states[1] == 0
+    for _ in range(10):
+        assert cameras.accused(areas(0.0, 0.0), areas(0.0, 0.0), EVERYBODY) is None
+        cameras.weigh(EVERYBODY, areas(0.0, 0.0))
+    assert not cameras.states.any()
+
+
+def test_a_wrong_camera_is_used_again_when_its_residual_is_normal() -> None:
+    cameras = Cameras(CAMERAS, 15.0)
+    cameras.be(1, WRONG)
+    for _ in range(5):
+        cameras.weigh(~EVERYBODY | (np.arange(CAMERAS) == 1), areas(9.0, 9.0))
+        assert STATES[cameras.states[1]] == WRONG
+    for _ in range(3):
+        cameras.weigh(EVERYBODY, areas(0.0, 0.0))
+    assert not cameras.states.any()

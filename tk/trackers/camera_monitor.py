@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,10 +26,9 @@ from tk.model.cameras.landmark_agreement import evidence_for_cameras
 from tk.model.cues.ray_costs import residual_of
 from tk.model.masks.image_health import MOVED, HealthState, ImageHealth, described
 from tk.model.masks.mask_agreement import Agreement, MaskAgreement
-from tk.model.masks.regions import SQUARE3
 from tk.model.setup import Setup, Subject
 from tk.model.stateful import Stateful
-from tk.trackers.judgement import FAULTS, STATES, WRONG, Belief, Cameras, FrameJudge, JudgeState, likelihoods
+from tk.trackers.judgement import FAULTS, STATES, TORN, WRONG, Belief, Cameras, FrameJudge, JudgeState, likelihoods
 from tk.trackers.protocol import Estimate, Frame, Tracker, shows_person, without_cameras
 from tk.trackers.reason import Reason, is_lost
 from tk.trackers.region import RegionTracker
@@ -179,7 +177,8 @@ class CameraMonitor(Stateful[MonitorState]):
         if np.count_nonzero(shows_person(used.masks)) < 2:
             used = without_cameras(frame, np.ones(len(out), bool))  # one view does not determine depth
         if self._region is not None and np.count_nonzero(~cameras.unfit) >= 3:
-            estimate, used = self._weigh(self._region, frame, used)
+            estimate, used, torn = self._weigh(self._region, frame, used)
+            out = np.where(torn, STATES.index(TORN), out)
         else:
             estimate = self.tracker.step(used)
         out = np.where(out > 0, out, cameras.states)
@@ -191,48 +190,49 @@ class CameraMonitor(Stateful[MonitorState]):
                 _count(self._spans, f"{camera}/{STATES[state]}", frame.index)
         return estimate, used
 
-    def _weigh(self, tracker: RegionTracker, frame: Frame, used: Frame) -> tuple[Estimate, Frame]:
-        """Step the tracker, and judge the cameras by their residuals. Return the estimate and the observation without
-        the cameras that were left out.
+    def _weigh(self, tracker: RegionTracker, frame: Frame, used: Frame) -> tuple[Estimate, Frame, NDArray[np.bool_]]:
+        """Step the tracker, and judge the cameras by their residuals. Return the estimate, the observation without the
+        cameras that were left out, and (C,) those whose masks are torn.
 
         Cameras that see the person from the same or from opposite sides say nothing about another one, because they do
         not determine a pose.
         """
         cameras, before = self._cameras, tracker.state
+        torn = np.zeros(len(frame.masks), np.bool_)
         estimate = tracker.step(used)
         if estimate.residual is None or not shows_person(used.masks).any():
-            return estimate, used
+            return estimate, used, torn
         residual, left_out = estimate.residual, (cameras.states > 0) & ~cameras.unfit
         kept = (cameras.states == 0) & np.isfinite(residual[:, 0])
-        touched = touched_by_others(tracker.screen.sample(frame.masks))
-        accused = self._accused(tracker, residual, kept, touched)
+        accused = self._accused(tracker, residual, kept)
         if left_out.any() or accused is not None:
             residual = self._residual(tracker, frame, estimate)
-            accused = self._accused(tracker, residual, kept, touched)
-        if accused is not None:
-            others = kept & (np.arange(len(kept)) != accused)
-            if determine_depth(self._setup.rig.centers, estimate.joints.mean(axis=0), others):
-                after, fewer = tracker.state, without_cameras(used, ~others)
-                tracker.state = before
-                second = tracker.step(fewer)
-                again = self._residual(tracker, frame, second)
-                # both poses by a baseline that has not learned this frame from the camera
-                with_it, without = (_likelihoods(tracker, found, touched) for found in (residual, again))
-                if cameras.judge(accused, others, with_it, without):
-                    estimate, used, residual = second, fewer, again
-                else:
-                    tracker.state = after
-        cameras.weigh(left_out & np.isfinite(residual[:, 0]), _likelihoods(tracker, residual, touched))
-        return estimate, used
+            accused = self._accused(tracker, residual, kept)
+        others = kept & (np.arange(len(kept)) != accused)
+        if accused is not None and determine_depth(self._setup.rig.centers, estimate.joints.mean(axis=0), others):
+            after, fewer = tracker.state, without_cameras(used, ~others)
+            tracker.state = before
+            second = tracker.step(fewer)
+            again = self._residual(tracker, frame, second)
+            # both poses by a baseline that has not learned this frame from the camera
+            with_it, without = (_likelihoods(tracker, found) for found in (residual, again))
+            fault = cameras.judge(accused, others, with_it, without)
+            if fault:
+                torn[accused] = fault == TORN
+                estimate, used, residual = second, fewer, again
+            else:
+                tracker.state = after
+        # the others' residuals are explained by the accused one; and without a third camera nothing is judged
+        weighed = left_out if accused is not None or np.count_nonzero(kept) < 3 else left_out | kept
+        cameras.weigh(weighed & np.isfinite(residual[:, 0]), _likelihoods(tracker, residual))
+        return estimate, used, torn
 
-    def _accused(
-        self, tracker: RegionTracker, residual: Float, kept: NDArray[np.bool_], touched: NDArray[np.bool_]
-    ) -> int | None:
+    def _accused(self, tracker: RegionTracker, residual: Float, kept: NDArray[np.bool_]) -> int | None:
         """Return the camera that is to be judged, by a residual (C, 2); None if none is."""
         if np.count_nonzero(kept) < 3:
             return None
         best = likelihoods(np.zeros_like(residual), tracker.residuals.spread)
-        return self._cameras.accused(_likelihoods(tracker, residual, touched), best, kept)
+        return self._cameras.accused(_likelihoods(tracker, residual), best, kept)
 
     def _residual(self, tracker: RegionTracker, frame: Frame, estimate: Estimate) -> Float:
         """Return (C, 2) missing and surplus area at the estimate's pose, of excluded cameras, too. Missing area on
@@ -277,18 +277,9 @@ class CameraMonitor(Stateful[MonitorState]):
         return lines
 
 
-def _likelihoods(tracker: RegionTracker, residual: Float, touched: NDArray[np.bool_]) -> Float:
+def _likelihoods(tracker: RegionTracker, residual: Float) -> Float:
     """Return (C, 3) those of the cameras' states, from a residual (C, 2)."""
-    return likelihoods(tracker.residuals.excess(residual), tracker.residuals.spread, touched)
-
-
-def touched_by_others(masks: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Return (C,) whether pixels of others touch those of the person in masks (C, h, w)."""
-    others = masks == OTHERS
-    return np.array([
-        bool(mine.any() and (cv2.dilate(mine.view(np.uint8), SQUARE3) & (mask >= PERSON)).any())
-        for mine, mask in zip(others, masks, strict=True)
-    ])  # fmt: skip
+    return likelihoods(tracker.residuals.excess(residual), tracker.residuals.spread)
 
 
 def _count(spans: dict[str, Span], key: str, index: int) -> None:

@@ -4,13 +4,16 @@
 (:mod:`tk.model.masks.image_health`) is certain, and counts for one frame. Evidence of its mask is the missing and the
 surplus area, as excess above the camera's baseline, in spreads. Three states explain it:
 
-- right: both areas are normal; surplus area may be somebody or something else in the mask.
-- torn: in a part of the frames any part of the mask is missing; surplus area as of a right camera.
+- right: both areas are normal.
+- poor: in a part of the frames, pieces of the person are missing from the mask, and it shows pieces of other things,
+  such as something that the person carries. In a few of these frames the mask misleads: it is *torn*.
 - wrong: any missing and any surplus area. A camera that is turned, moved or late has both.
 
-A wrong pose explains a high residual, too. So the evidence of one frame is a comparison of explanations: the person is
-tracked with the camera and without it (:meth:`Cameras.judge`). A camera that is left out is weighed in each frame at
-the pose that the others give, by forward probabilities (Rabiner, *Proceedings of the IEEE*, 1989).
+A poor mask of a right camera is used, because the others fit as well with it. So where a residual speaks against a
+camera, the person is tracked with the camera and without it (:meth:`Cameras.judge`), and what the others gain decides.
+A torn mask is left out in its frame. A wrong camera is left out until it is right: it is weighed in each frame at the
+pose that the others give. What several frames show is combined by forward probabilities (Rabiner, *Proceedings of the
+IEEE*, 1989).
 
 **Frames.** What a frame itself shows is its first reason: the numbers that the tracker reports (:class:`Match`), or a
 pose that is impossible after the last one (:class:`FrameJudge`). :func:`judge_frames` adds what several frames show
@@ -62,7 +65,7 @@ WRONG, TORN = "wrong", "torn"
 #: faults of a camera by the names of its states
 FAULTS = {
     WRONG: Fault("disagrees with the others", False),
-    TORN: Fault("misses a part of the person", False),
+    TORN: Fault("shows other things, or misses a part of the person", False),
     **{name: Fault(text, True) for name, (text, _) in IMAGE_FAULTS.items()},
 }
 STATES = ("used", *FAULTS)
@@ -70,40 +73,37 @@ _CERTAIN = np.array([False, *(fault.certain for fault in FAULTS.values())])
 #: meaning of each value of `/evidence/camera`
 STATE_MEANINGS = ("0: used", *(f"{value}: {fault.text}" for value, fault in enumerate(FAULTS.values(), 1)))
 
-# Faults of a camera a second: each kind begins once in eleven minutes, and lasts five seconds.
-_BEGIN_HZ, _END_HZ = 0.0015, 0.2
+# Faults of a camera a second: each kind begins once in eleven minutes, and lasts five seconds. Poor masks a second.
+_BEGIN_HZ, _END_HZ, _POOR_HZ = 0.0015, 0.2, 0.03
 # Least probability of a state.
 _LEAST = 1e-9
 # Wrong poses a second, whatever the cameras are.
 _LOSE_HZ = 0.3
-# Share of the frames in which a torn mask is whole; probability that a right mask shows something else, too; and that
-# pixels of people who touch each other in an image are taken for one another's.
-_WHOLE, _FOREIGN, _MIXED = 0.5, 1e-4, 0.01
+# Of the frames with a poor mask: the share in which it misses nothing, and in which it shows nothing else; the share in
+# which it misleads. The mean size of a piece, as a share of the person's pixels.
+_WHOLE, _TORN, _PIECE = 0.5, 0.05, 0.15
 
 
-def likelihoods(excess: Float, spread: Float, touched: Bool | bool = False) -> Float:
-    """Return (C, 3) logarithms of the likelihoods of the states right, wrong and torn; 0 if the excess is unknown.
+def likelihoods(excess: Float, spread: Float) -> Float:
+    """Return (C, 3) logarithms of the likelihoods of the states right, poor and wrong; 0 if the excess is unknown.
 
     Args:
         excess: (C, 2) of missing and surplus area, in spreads.
-        spread: (C,) of the areas, shares of the person's pixels: if a mask shows anything, all areas between 0 and 1
-            are equally likely.
-        touched: (C,) whether another person's pixels touch this person's: the mask of a right camera may then miss
-            anything, and show anything.
+        spread: (C,) of the areas, shares of the person's pixels: if a camera is wrong, all areas between 0 and 1 are
+            equally likely; pieces have an exponential distribution.
     """
-    normal = -(np.fmax(excess, 0.0) ** 2) / 2 - np.log(2 * np.pi) / 2
-    anything = np.log(spread)
-    surplus = np.logaddexp(np.log1p(-_FOREIGN) + normal[:, 1], np.log(_FOREIGN) + anything)
-    torn = np.logaddexp(np.log(_WHOLE) + normal[:, 0], np.log1p(-_WHOLE) + anything)
-    mixed = np.log(_MIXED) + 2 * anything
-    right = np.where(touched, np.logaddexp(normal[:, 0] + surplus, mixed), normal[:, 0] + surplus)
-    found = np.stack([right, 2 * anything, torn + surplus], axis=1)
+    over = np.fmax(excess, 0.0)
+    normal = -(over**2) / 2 - np.log(2 * np.pi) / 2
+    anything = np.log(spread)[:, None]
+    pieces = anything - np.log(_PIECE) - over * spread[:, None] / _PIECE
+    poor = np.logaddexp(np.log(_WHOLE) + normal, np.log1p(-_WHOLE) + pieces).sum(axis=1)
+    found = np.stack([normal.sum(axis=1), poor, 2 * anything[:, 0]], axis=1)
     return np.where(np.isfinite(excess[:, :1]), found, 0.0)
 
 
 @dataclass(frozen=True)
 class Belief:
-    """(C, S) the probability of each of :data:`STATES` of each camera."""
+    """(C, 1 + S) the probability that each camera is right, that its mask is poor, and of each other state."""
 
     probability: Float
 
@@ -114,17 +114,22 @@ class Cameras(Stateful[Belief]):
     State = Belief
 
     def __init__(self, count: int, fps: float) -> None:
-        self._probability = np.zeros((count, len(STATES)))
+        self._probability = np.zeros((count, 1 + len(STATES)))
         self._probability[:, 0] = 1.0
         self._fps = fps
-        begin = _BEGIN_HZ / fps
-        self._prior = np.log([1 - 2 * begin, begin, begin])
+        begin, poor, end = _BEGIN_HZ / fps, min(_POOR_HZ / fps, 0.5), min(_END_HZ / fps, 0.5)
+        after = end * _POOR_HZ / (_END_HZ + _POOR_HZ)  # the mask of a camera that was wrong may be poor
+        self._transition = np.array([
+            [1 - poor - begin, poor, begin],
+            [end, 1 - end - begin, begin],
+            [end - after, after, 1 - end],
+        ])  # fmt: skip
 
     @property
     def states(self) -> NDArray[np.uint8]:
         """(C,) index of each camera's state in :data:`STATES`; 0 unless a fault is likelier than none."""
-        faults = 1 + self._probability[:, 1:].argmax(axis=1)
-        return np.where(self._probability[:, 0] < 0.5, faults, 0).astype(np.uint8)
+        faults = 1 + self._probability[:, 2:].argmax(axis=1)
+        return np.where(self._probability[:, :2].sum(axis=1) < 0.5, faults, 0).astype(np.uint8)
 
     @property
     def unfit(self) -> Bool:
@@ -133,7 +138,9 @@ class Cameras(Stateful[Belief]):
 
     def be(self, camera: int, state: str) -> None:
         """Take a camera's state for certain."""
-        self._probability[camera] = np.arange(len(STATES)) == STATES.index(state)
+        index = STATES.index(state)
+        self._probability[camera] = 0.0
+        self._probability[camera, index + (index > 0)] = 1.0
 
     def look(self, faults: Sequence[str | None]) -> None:
         """Take in the faults of the images of the next frame; None for an image without one."""
@@ -142,49 +149,61 @@ class Cameras(Stateful[Belief]):
                 self.be(camera, fault or "used")
 
     def weigh(self, cameras: Bool, likelihood: Float) -> None:
-        """Weigh cameras (C,) that are left out, by the likelihoods (C, 3) of their residual at the others' pose."""
-        end = min(_END_HZ / self._fps, 0.5)
-        begin = np.exp(self._prior)
+        """Weigh cameras (C,) by the likelihoods (C, 3) of their residual."""
+        nats = self._expected() + likelihood
         for camera in np.flatnonzero(cameras):
-            right, wrong, torn = np.maximum(self._probability[camera, :3], _LEAST)
-            before = right * begin + np.array([(wrong + torn) * end, wrong * (1 - end), torn * (1 - end)])
-            self._probability[camera, :3] = _normalised(np.log(before) + likelihood[camera])
+            self._probability[camera, :3] = _normalised(nats[camera])
 
     def accused(self, likelihood: Float, best: Float, kept: Bool) -> int | None:
         """Return which of the cameras used, ``kept`` (C,), is to be judged; None if none is.
 
-        Its residual must speak against it; and with what the others can gain without it at most, a fault must be
-        likelier than none.
+        Its residual must speak against it; and with what the others can gain without it at most, it must be likelier
+        that it misleads than that it does not.
 
         Args:
             likelihood: (C, 3) at the pose of all of them.
             best: (C, 3) of residuals without an excess.
         """
-        against = np.where(kept, likelihood[:, 1:].max(axis=1) - likelihood[:, 0], -np.inf)
-        camera = int(np.argmax(against))
+        right, poor, wrong = (self._expected() + likelihood).T
+        odds = np.logaddexp(poor + np.log(_TORN), wrong) - np.logaddexp(right, poor + np.log1p(-_TORN))
+        doubtful = kept & (likelihood[:, 1:].max(axis=1) > likelihood[:, 0])
+        camera = int(np.argmax(np.where(doubtful, odds, -np.inf)))
         others = kept & (np.arange(len(kept)) != camera)
-        gain = self._marginal(best[others]) - self._marginal(likelihood[others])
-        return camera if against[camera] > 0 and against[camera] + self._prior[1] + gain > 0 else None
+        gain = self._marginal(best, others) - self._marginal(likelihood, others)
+        return camera if doubtful[camera] and odds[camera] + gain > 0 else None
 
-    def judge(self, camera: int, others: Bool, with_it: Float, without: Float) -> bool:
-        """Return whether a camera has a fault, from the likelihoods (C, 3) at the poses with it and without it.
+    def judge(self, camera: int, others: Bool, with_it: Float, without: Float) -> str | None:
+        """Return the fault of a camera, if it has one, from the likelihoods (C, 3) at the poses with it and without it.
 
-        Four explanations are compared: the camera is right, wrong or torn; or the pose is wrong, so that all residuals
-        may be anything. ``others``: (C,) the other cameras used.
+        The explanations that are compared: the camera is right; its mask is poor; the pose is wrong, so that all
+        residuals may be anything; or the pose without the camera is right, and the mask is torn or the camera wrong.
+        ``others``: (C,) the other cameras used.
         """
-        right = self._prior[0] + with_it[camera, 0] + self._marginal(with_it[others])
-        lost = np.log(_LOSE_HZ / self._fps) + with_it[camera, 1] + with_it[others, 1].sum()
-        faults = self._prior[1:] + without[camera, 1:] + self._marginal(without[others])
-        probability = _normalised(np.array([np.logaddexp(right, lost), *faults]))
-        found = bool(probability[0] < 0.5)
-        if found:
-            self.be(camera, WRONG)
-            self._probability[camera, :3] = probability
-        return found
+        right, poor, wrong = self._expected()[camera]
+        all_used, fewer = self._marginal(with_it, others), self._marginal(without, others)
+        probability = _normalised(
+            np.array([
+                np.logaddexp(
+                    right + with_it[camera, 0] + all_used,
+                    np.log(_LOSE_HZ / self._fps) + with_it[camera, 2] + with_it[others, 2].sum(),
+                ),
+                poor + np.log1p(-_TORN) + with_it[camera, 1] + all_used,
+                wrong + without[camera, 2] + fewer,
+                poor + np.log(_TORN) + without[camera, 1] + fewer,
+            ])
+        )  # fmt: skip
+        self._probability[camera, :3] = probability[:3] + np.array([0.0, probability[3], 0.0])
+        if self.states[camera]:
+            return WRONG
+        return TORN if probability[2:].sum() > 0.5 else None
 
-    def _marginal(self, likelihood: Float) -> float:
-        """Return the logarithm of the likelihood of N cameras in unknown states, from those (N, 3) of each state."""
-        return float(np.logaddexp.reduce(self._prior + likelihood, axis=1).sum())
+    def _expected(self) -> Float:
+        """Return (C, 3) logarithms of the probabilities of the states, before the frame's masks are seen."""
+        return np.asarray(np.log(np.maximum(self._probability[:, :3] @ self._transition, _LEAST)))
+
+    def _marginal(self, likelihood: Float, cameras: Bool) -> float:
+        """Return the logarithm of the likelihood of cameras (C,) in unknown states, from those (C, 3) of each state."""
+        return float(np.logaddexp.reduce((self._expected() + likelihood)[cameras], axis=1).sum())
 
 
 def _normalised(nats: Float) -> Float:
