@@ -29,6 +29,7 @@ META = ResultMeta(
     sigma=True,
     residual_cameras=("cam1", "cam2", "cam3"),
     landmark_names=("nose", "toe_r"),
+    depth=True,
     mask_sources=("scene", "segmenter"),
     reasons=("0: nothing", "1: a loss"),
     judged=True,
@@ -67,6 +68,7 @@ def make_frame(index: int) -> dict[str, Any]:
         frame["joints/sigma"] = np.full(15, 0.01 * index)
     if index % 4 != 1:
         frame["landmarks"] = np.arange(18.0).reshape(3, 2, 3) + index
+        frame["landmark_depth"] = np.arange(6.0).reshape(3, 2) - index
     if index % 5:
         count = 200 + index % 37
         frame["hull/positions"] = np.full((count, 3), index / 8)

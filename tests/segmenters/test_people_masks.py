@@ -153,7 +153,7 @@ def test_landmarks_of_everybody_in_each_image_are_returned(
     places = [(-0.6, 0.2), (0.6, -0.1)]
     images, _ = shown(places)
     landmarks = masks_of(segmenter).label(images).landmarks
-    assert landmarks.shape == (2, 4, len(LANDMARKS), 3)
+    assert landmarks.shape == (2, 4, len(LANDMARKS), 4)
     rows = [LANDMARKS.index(name) for name in top + bottom]
     assert np.isnan(np.delete(landmarks, rows, axis=2)).all()
     feet = [triangulate_joints(RIG, person)[0][LANDMARKS.index(bottom[0])] for person in landmarks]
@@ -166,9 +166,9 @@ def test_landmarks_of_everybody_in_each_image_are_returned(
 
 def test_segmenter_without_landmarks_returns_unknown_ones() -> None:
     found = masks_of(OneOfMany()).label(shown([(0.2, 0.1)])[0])
-    assert found.landmarks.shape == (1, 4, len(LANDMARKS), 3) and np.isnan(found.landmarks).all()
+    assert found.landmarks.shape == (1, 4, len(LANDMARKS), 4) and np.isnan(found.landmarks).all()
     nobody = masks_of(Posed()).label(shown([])[0])
-    assert nobody.landmarks.shape == (0, 4, len(LANDMARKS), 3)
+    assert nobody.landmarks.shape == (0, 4, len(LANDMARKS), 4)
 
 
 @pytest.mark.parametrize(("names", "count"), [((), 12), (("nose", "heel_l"), 2)])

@@ -100,7 +100,7 @@ def retimed(store: MaskStore, frames: NDArray[np.int64], late: NDArray[np.int64]
 def retimed_landmarks(
     landmarks: NDArray[np.float64] | None, frames: NDArray[np.int64], late: NDArray[np.int64]
 ) -> NDArray[np.float64] | None:
-    """Return the landmarks (F, C, L, 3) of frames (F,) of cameras that are late by whole frames (C,); NaN if a camera
+    """Return the landmarks (F, C, L, 4) of frames (F,) of cameras that are late by whole frames (C,); NaN if a camera
     has no image."""
     if landmarks is None or not late.any():
         return landmarks

@@ -184,7 +184,7 @@ def _with_rows(to: Result, rows: NDArray[np.int64], source: Result, other: NDArr
 #: the columns of a result that are exchanged, by dataset
 COLUMNS = {
     "pose": "pose", "joints/position": "joints", "joints/sigma": "sigma", "residual": "residual", "status": "status",
-    "objective": "objective", "landmarks": "landmarks", "evidence/reason": "reason",
+    "objective": "objective", "landmarks": "landmarks", "landmark_depth": "landmark_depth", "evidence/reason": "reason",
     "evidence/camera": "camera_state", "evidence/found": "found", "evidence/origin": "origin",
     "evidence/sigma": "deviation",
 }  # fmt: skip

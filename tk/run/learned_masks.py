@@ -114,7 +114,7 @@ class LearnedMasks:
 
     def label(self, frame: FrameSet) -> tuple[Masks, Bool, NDArray[np.uint8], NDArray[np.float64] | None, Masks | None]:
         """Return masks (C, H, W), uncertain pixels (C, H, W), where each camera's mask comes from (C,), and the
-        landmarks (N, C, L, 3) and the people's masks (C, H, W) if the segmenter was asked for this frame."""
+        landmarks (N, C, L, 4) and the people's masks (C, H, W) if the segmenter was asked for this frame."""
         span = self._follow(frame) if self._source.frame_count is None else self._span_of(frame.index)
         before, after = span.around(frame.index) if span.samples else (None, None)
         asked = before is not None and before is after and before.index == frame.index

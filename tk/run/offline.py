@@ -321,11 +321,12 @@ class _Finisher:
         return np.round(found * self.task.setup.fps).astype(np.int64)
 
     def _landmarks(self, draft: _Draft, late: NDArray[np.int64]) -> NDArray[np.float64] | None:
-        """Return the landmarks (F, C, L, 3) of a draft, in pixels of the cameras in use, synchronised with videos that
+        """Return the landmarks (F, C, L, 4) of a draft, in pixels of the cameras in use, synchronised with videos that
         are late by whole frames (C,); None if it has none."""
-        found = draft.current("landmarks")
-        if found is None:
+        found, depth = draft.current("landmarks"), draft.current("landmark_depth")
+        if found is None or depth is None:
             return None
+        found = np.concatenate([found, depth[..., None]], axis=-1)
         return retimed_landmarks(self.task.setup.rig.reduced_pixels(found), draft.result.frames, late)
 
     def _track_again(

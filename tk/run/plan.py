@@ -159,6 +159,7 @@ class Plan:
             residual_cameras=setup.rig.names if tracker.reports_sigma else (),
             mask_sources=sources_of_masks(task.source) if tracker.reports_sigma else (),
             landmark_names=landmarks,
+            depth=bool(landmarks),
             reasons=MEANINGS,
             judged=True,
             deviation=tracker.reports_sigma,

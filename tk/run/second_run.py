@@ -129,7 +129,7 @@ def track_again(
         source: with the new delays; its length is known.
         setup: the scene.
         subject: what is known of the person.
-        landmarks: (C, L, 3) of the person by frame, with the new delays, where there are any.
+        landmarks: (C, L, 4) of the person by frame, with the new delays, where there are any.
         within: receives the share that is done.
     """
     (tracker, masks), frame_count = now, source.frame_count

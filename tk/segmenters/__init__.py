@@ -56,8 +56,9 @@ class PoseSegmenter(Protocol):
     """
 
     def segment_pose(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """Return the probability (h, w) of :meth:`Segmenter.segment`, and the landmarks (L, 3) of the same person: x,
-        y, pixels of the image (h, w, 3), and visibility, 0 to 1; NaN if there is nobody.
+        """Return the probability (h, w) of :meth:`Segmenter.segment`, and the landmarks (L, 3) or (L, 4) of the same
+        person: x, y, pixels of the image (h, w, 3), and visibility, 0 to 1; NaN if there is nobody. A fourth column
+        is the depth: metres behind the middle of the hips, along the line of sight.
         """
         ...
 
@@ -93,24 +94,24 @@ def load(name: str) -> Segmenter:
 def segmented(
     segmenter: Segmenter, name: str, image: NDArray[np.uint8]
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Return the checked result of a segmenter for an image: the probabilities (h, w), and the landmarks (L, 3) in the
+    """Return the checked result of a segmenter for an image: the probabilities (h, w), and the landmarks (L, 4) in the
     order of :data:`~tk.model.body.body_points.LANDMARKS`, NaN where the segmenter has none.
 
     Raises:
-        ConfigError: the result is not a probability for each pixel, or not one row of three numbers for each landmark.
+        ConfigError: the result is not a probability for each pixel, or not three or four numbers for each landmark.
     """
-    landmarks = np.full((len(LANDMARKS), 3), np.nan)
+    landmarks = np.full((len(LANDMARKS), 4), np.nan)
     if isinstance(segmenter, PoseSegmenter):
         names = getattr(segmenter, "landmarks", JOINT_LANDMARKS)
         found, seen = segmenter.segment_pose(image)
-        if np.shape(seen) != (len(names), 3):
+        if np.shape(seen) not in ((len(names), 3), (len(names), 4)):
             raise ConfigError(
-                f"segmenter {name}: returned landmarks {np.shape(seen)}; they must be ({len(names)}, 3): x, y and "
-                "visibility of each landmark"
+                f"segmenter {name}: returned landmarks {np.shape(seen)}; they must be ({len(names)}, 3) or "
+                f"({len(names)}, 4): x, y, visibility and, if it is known, depth of each landmark"
             )
         for each, row in zip(names, seen, strict=True):
             if each in LANDMARKS:
-                landmarks[LANDMARKS.index(each)] = row
+                landmarks[LANDMARKS.index(each), : len(row)] = row
     else:
         found = np.asarray(segmenter.segment(image))
     if found.shape != image.shape[:2] or found.dtype.kind != "f":

@@ -36,6 +36,7 @@ _LEAST_PRESENT = 0.05
 # The pose network's points, each with x, y, z, visibility, presence (MediaPipe's tensors_to_pose_landmarks).
 _POINTS, _COLUMNS = 39, 5
 _VISIBLE = 3  # column, a logit
+_WORLD = 3  # columns of the points in space: metres from the middle of the hips, along the image's axes and away
 # Rows of the network's points that correspond to a point of the body; the eyes are their centres.
 _ROWS = {
     "nose": 0, "eye_l": 2, "eye_r": 5, "ear_l": 7, "ear_r": 8, "shoulder_l": 11, "shoulder_r": 12, "elbow_l": 13,
@@ -101,7 +102,9 @@ class BlazePose:
         (logits,) = (a for a in found if a.shape[1:3] == (_POSE_SIDE,) * 2)
         (rows,) = (a.reshape(-1, _COLUMNS) for a in found if a.size == _POINTS * _COLUMNS)
         used = rows[list(_ROWS.values())].astype(np.float64)
-        landmarks = np.column_stack([(used[:, :2] + 0.5) / scale - 0.5, _probability(used[:, _VISIBLE])])
+        (world,) = (a.reshape(-1, _WORLD) for a in found if a.size == _POINTS * _WORLD)
+        depth = world[list(_ROWS.values()), 2].astype(np.float64)
+        landmarks = np.column_stack([(used[:, :2] + 0.5) / scale - 0.5, _probability(used[:, _VISIBLE]), depth])
         (present,) = (float(a.item()) for a in found if a.size == 1)
         landmarks[:, 2] *= present
         if not present >= _LEAST_PRESENT:

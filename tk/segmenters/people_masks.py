@@ -73,7 +73,7 @@ class _Person:
     Attributes:
         patches: one per camera.
         masks, uncertain: (C, H, W) uint8, 0 or 255, and bool.
-        landmarks: (C, L, 3) x, y, pixels, and visibility; NaN where there are none.
+        landmarks: (C, L, 4), see :mod:`tk.model.cues.landmarks`; NaN where there are none.
     """
 
     patches: list[Patch]
@@ -88,7 +88,7 @@ class Segmented(NamedTuple):
     Attributes:
         masks: (C, H, W) uint8, 0 or 255.
         uncertain: (C, H, W) bool, where the mask is 0.
-        landmarks: (N, C, L, 3) x, y, pixels, and visibility of each of N people's landmarks in each image, see
+        landmarks: (N, C, L, 4) of each of N people's landmarks in each image, see
             :data:`~tk.model.body.body_points.LANDMARKS`; NaN where an image shows none.
         people: (C, H, W) uint8, bit n: the mask of person n shows the pixel. Of the first eight people.
     """
@@ -125,7 +125,7 @@ class PeopleMasks:
             masks |= person.masks
             bits |= person.masks & np.uint8(1 << n if n < 8 else 0)
             uncertain |= person.uncertain
-        shape = len(people), len(images), len(LANDMARKS), 3
+        shape = len(people), len(images), len(LANDMARKS), 4
         landmarks = np.array([person.landmarks for person in people]).reshape(shape)
         return Segmented(masks, uncertain & (masks == 0), associated(self._rig, landmarks), bits)
 
@@ -264,7 +264,7 @@ class PeopleMasks:
 
     def _empty(self, patches: Sequence[Patch]) -> _Person:
         shape = len(self._rig), *self._rig.frame_shape
-        landmarks = np.full((len(self._rig), len(LANDMARKS), 3), np.nan)
+        landmarks = np.full((len(self._rig), len(LANDMARKS), 4), np.nan)
         return _Person(list(patches), np.zeros(shape, np.uint8), np.zeros(shape, np.bool_), landmarks)
 
     def _ask_again(self, images: Images, c: int, person: _Person, patch: Patch) -> None:
@@ -297,12 +297,12 @@ class PeopleMasks:
 
     def _seen(self, image: Images, c: int, patch: Patch) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
         """Return the probability (H, W) of each pixel to show the person in the middle of a square, 0 outside it; and
-        the person's landmarks (L, 3) in the image."""
+        the person's landmarks (L, 4) in the image."""
         whole = np.zeros(image.shape[:2], np.float32)
         picture = self._shown(image, c)
         found, landmarks = segmented(self._segmenter, self._name, patch.cut(picture))
         self._shown(whole, c)[...] = patch.paste(found, picture.shape[:2])
-        return whole, np.column_stack([patch.in_image(landmarks[:, :2]), landmarks[:, 2]])
+        return whole, np.column_stack([patch.in_image(landmarks[:, :2]), landmarks[:, 2:]])
 
     def _shown(self, image: NDArray, c: int) -> NDArray:
         """Return the part (h, w) of a padded image (H, W) that the camera shows."""

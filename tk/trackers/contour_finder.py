@@ -287,7 +287,7 @@ class ContourFinder:
         return replace(pyramid, landmarks=of_person(frame.landmarks, pyramid.masks[0]))
 
     def sighted(self, landmarks: Float) -> RenderedBody | None:
-        """Return the average body on the grid :attr:`choice`, at the pose that a person's landmarks (V, L, 3) show;
+        """Return the average body on the grid :attr:`choice`, at the pose that a person's landmarks (V, L, 4) show;
         None if no two images agree on them."""
         points = consensus(self.views.rig, landmarks).points
         if not np.isfinite(points).any():

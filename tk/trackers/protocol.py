@@ -41,7 +41,7 @@ class Frame:
             the scene's colour. A body part there costs half. None if unknown.
         time: time stamp of the source, seconds.
         sources: (C,) uint8, where a segmenter's masks come from, see :mod:`tk.run.learned_masks`; None for others.
-        landmarks: (N, C, L, 3) x, y, pixels, and visibility of the landmarks of N people in view, see
+        landmarks: (N, C, L, 4) x, y, pixels, visibility and depth of the landmarks of N people in view, see
             :mod:`tk.model.cues.landmarks`; NaN where they are unknown. None if no network saw this frame.
         people: (C, H, W) uint8, bit n: the network's mask of person n of ``landmarks`` shows the pixel. None if no
             network saw this frame.
@@ -78,7 +78,7 @@ class Estimate:
             in what :func:`tk.track` hands out. drawn: (C, h, w) bool, where the body is on the tracker's grid of rays,
             cameras left out included; None likewise.
         mask_source: (C,) uint8, as ``Frame.sources``.
-        landmarks: (C, L, 3) those of this person among ``Frame.landmarks``; None if there are none.
+        landmarks: (C, L, 4) those of this person among ``Frame.landmarks``; None if there are none.
         found: the reason that the frame itself shows.
         judged: the reason by the last frames, too; None before the frame is judged.
         cameras: (C,) uint8, which cameras were left out, and why: indices in :data:`~tk.trackers.judgement.STATES`.
@@ -212,7 +212,7 @@ class SharingTracker(Tracker, Protocol):
     screen: RayGrid
 
     def sighted(self, landmarks: Float) -> RenderedBody | None:
-        """Return an average body on the grid :attr:`choice`, at the pose that a person's landmarks (C, L, 3) show; None
+        """Return an average body on the grid :attr:`choice`, at the pose that a person's landmarks (C, L, 4) show; None
         if no two images agree on them."""
         ...
 
@@ -268,7 +268,7 @@ class TwoPassTracker(Tracker, Protocol):
         Args:
             masks: (C, H, W) of N frames, cleaned.
             poses: (N, D).
-            landmarks: (N, C, L, 3), NaN where they are unknown; None without any.
+            landmarks: (N, C, L, 4), NaN where they are unknown; None without any.
         """
         ...
 
@@ -303,7 +303,7 @@ class TwoPassTracker(Tracker, Protocol):
             lost: (F,) bool; such frames are not used and do not change.
             residual: (F, C, 2) of the first pass; NaN where a camera was excluded.
             height_m: the subject's height, if known.
-            landmarks: (F, C, L, 3) of the first pass, NaN where there are none.
+            landmarks: (F, C, L, 4) of the first pass, NaN where there are none.
             keep_body: leave the body as it is.
             report: receives the share of the work that is done.
 

@@ -75,7 +75,7 @@ class SecondPass:
     Args:
         tracker: with the body and the cameras of this pass.
         masks: (C, H, W) of each frame, cleaned.
-        landmarks: (F, C, L, 3) of each frame, NaN where there are none; None if no frame has any.
+        landmarks: (F, C, L, 4) of each frame, NaN where there are none; None if no frame has any.
         poses: (F, D) of the first pass.
         lost: (F,) bool; such frames are not used and do not change.
         residual: (F, C, 2) of the first pass; a camera whose residual is NaN in a frame is not used in it.

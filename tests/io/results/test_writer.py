@@ -46,6 +46,7 @@ def test_written_values_are_read_back(path: Path, tmp_path: Path) -> None:
         "objective": "objective", "iterations": "iterations", "joints/sigma": "sigma", "residual": "residual",
         "mask_source": "mask_source", "segments/rotation": "segments_rotation", "feet/position": "feet",
         "landmarks": "landmarks",
+        "landmark_depth": "landmark_depth",
     }  # fmt: skip
     for name, field in fields.items():
         np.testing.assert_array_equal(getattr(result, field)[6], make_frame(6)[name], err_msg=name)
@@ -80,6 +81,7 @@ def test_layout_is_the_contract(path: Path) -> None:
         "residual": ((2, 3, 2), "float64", {"cameras": META.residual_cameras, "areas": ("missing", "surplus")}),
         "mask_source": ((2, 3), "uint8", {"cameras": META.residual_cameras}),
         "landmarks": ((2, 3, 2, 3), "float32", {"names": META.landmark_names, "cameras": META.residual_cameras}),
+        "landmark_depth": ((2, 3, 2), "float32", {"names": META.landmark_names, "cameras": META.residual_cameras}),
         "iterations": ((2, 2), "int32", {"stages": META.stages}),
         "timing/optimise": ((2,), "float64", {}),
     }  # fmt: skip
@@ -189,11 +191,11 @@ def test_undeclared_datasets_are_absent(path: Path) -> None:
     """Also those of pose and joints have no columns in a result that has only a hull."""
     plain = replace(
         META, sigma=False, residual_cameras=(), mask_sources=(),
-        reasons=(), judged=False, deviation=False, camera_states=(), landmark_names=(), segment_names=(), feet=False,
-        angles=(), objective_kind="", pose_names=(), pose_units=(), joint_names=(), stages=(),
+        reasons=(), judged=False, deviation=False, camera_states=(), landmark_names=(), depth=False, segment_names=(),
+        feet=False, angles=(), objective_kind="", pose_names=(), pose_units=(), joint_names=(), stages=(),
     )  # fmt: skip
     empty = {"pose": (), "joints/position": np.zeros((0, 3)), "iterations": ()}
-    optional = ("joints/sigma", "residual", "mask_source", "landmarks", "segments", "feet", "angles")
+    optional = ("joints/sigma", "residual", "mask_source", "landmarks", "landmark_depth", "segments", "feet", "angles")
     with ResultWriter.create(path, plain) as writer:
         for index in range(3):
             frame = make_frame(index) | empty

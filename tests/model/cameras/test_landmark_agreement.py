@@ -29,7 +29,7 @@ def with_turned(rig: Rig, c: int, degrees: float, axis: str = "y") -> Rig:
 
 
 def seen(poses: np.ndarray = POSES, noise_m: float = NETWORK_M) -> list[np.ndarray]:
-    """Return the landmarks (1, C, L, 3) of one person in each frame."""
+    """Return the landmarks (1, C, L, 4) of one person in each frame."""
     return [landmarks_of(RIG, BODY, pose, noise_m, seed=i)[None] for i, pose in enumerate(poses)]
 
 
@@ -62,7 +62,7 @@ def test_cameras_that_others_cannot_test_have_no_evidence() -> None:
     for one in blind:
         one[:, 3] = np.nan
     assert np.isfinite(evidence_for_cameras(RIG, blind)).tolist() == [True, True, True, False]
-    assert np.isnan(evidence_for_cameras(RIG, [np.zeros((0, 4, 21, 3))])).all()
+    assert np.isnan(evidence_for_cameras(RIG, [np.zeros((0, 4, 21, 4))])).all()
 
 
 def test_ratio_falls_with_the_distance_and_is_bounded() -> None:
@@ -76,7 +76,7 @@ def test_ratio_falls_with_the_distance_and_is_bounded() -> None:
 
 
 def two_people() -> np.ndarray:
-    """(2, C, L, 3)."""
+    """(2, C, L, 4)."""
     behind = POSES[1].copy()
     behind[:2] += [0.45, 0.3]
     return np.stack([landmarks_of(RIG, BODY, pose, 0.02, seed=k) for k, pose in enumerate((POSES[0], behind))])
@@ -117,7 +117,7 @@ def test_sets_remain_where_too_few_images_show_the_person() -> None:
     people = two_people()
     people[:, 2:] = np.nan
     np.testing.assert_array_equal(associated(RIG, people), people)
-    assert associated(RIG, people[:0]).shape == (0, 4, 21, 3)
+    assert associated(RIG, people[:0]).shape == (0, 4, 21, 4)
 
 
 def test_people_sighted_as_one_are_told_apart_by_most_cameras() -> None:
@@ -133,7 +133,7 @@ def test_people_sighted_as_one_are_told_apart_by_most_cameras() -> None:
 
 
 def test_no_camera_agrees_without_a_pair_that_shows_one_person() -> None:
-    alone = np.full((4, 21, 3), np.nan)
+    alone = np.full((4, 21, 4), np.nan)
     alone[1] = landmarks_of(RIG, BODY, POSES[0], 0.02)[1]
     agree, points, _ = consensus(RIG, alone)
     assert not agree.any() and np.isnan(points).all()
@@ -143,7 +143,7 @@ def test_no_camera_agrees_without_a_pair_that_shows_one_person() -> None:
 
 
 def without(sets: np.ndarray, *cameras: int) -> np.ndarray:
-    """Return the landmarks (C, L, 3) without those of some cameras."""
+    """Return the landmarks (C, L, 4) without those of some cameras."""
     result = sets.copy()
     result[list(cameras)] = np.nan
     return result
@@ -169,7 +169,7 @@ def test_set_of_somebody_else_does_not_contradict_the_cameras_that_agree() -> No
     evidence = evidence_for_cameras(three, [mixed[None]])
     assert evidence[2] < 0 and not (evidence[:2] < 0).any()
     found = associated(three, np.stack([mixed]))[0]
-    assert np.isnan(found[2]).all() and np.isfinite(found[:2]).all()
+    assert np.isnan(found[2]).all() and np.isfinite(found[:2, :, :3]).all()
 
 
 def test_wrong_landmarks_of_another_image_are_not_held_against_a_camera() -> None:

@@ -14,7 +14,10 @@ from tk.kernels.mask_values import OTHERS
 from tk.model.body.body_points import POINTS
 from tk.model.body.limb_candidates import limbs_of, turned
 from tk.model.body.skeleton import JOINTS
+from tk.model.cameras.camera import Camera
 from tk.model.cues.landmarks import (
+    DEPTH_M,
+    DEPTH_SHARE,
     EXCHANGED,
     INDEPENDENT,
     LANDMARKS,
@@ -51,17 +54,70 @@ def marginal_cost(pose: np.ndarray, seen: np.ndarray) -> float:
         rows.append(camera.rotation[:2] - (q[:, :2] / q[:, 2:])[..., None] * camera.rotation[2])
     P, r = np.concatenate(rows, axis=1), np.concatenate(away, axis=1)  # (L, 2 V, 3), (L, 2 V)
     covariance = size**2 * (SEEN_M**2 * np.eye(r.shape[1]) + OFFSET_M**2 * P @ P.swapaxes(1, 2))
-    return float(0.5 * INDEPENDENT * (r * np.linalg.solve(covariance, r[..., None])[..., 0]).sum())
+    cost = (r * np.linalg.solve(covariance, r[..., None])[..., 0]).sum()
+    for bone in BONES if np.isfinite(seen[..., 3]).all() else ():
+        start, end = (LANDMARKS.index(name) for name in bone)
+        A = np.array([sight(camera, seen[v]) for v, camera in enumerate(RIG)])  # (V, 3)
+        share = DEPTH_SHARE[bone[0].endswith("_l") == bone[1].endswith("_l")]
+        r = size * (seen[:, end, 3] - seen[:, start, 3]) - share * A @ (points[end] - points[start])
+        cost += r @ np.linalg.solve(size**2 * (DEPTH_M**2 * np.eye(len(r)) + 2 * (share * OFFSET_M) ** 2 * A @ A.T), r)
+    return float(0.5 * INDEPENDENT * cost)
 
 
-def test_gradient_is_that_of_the_cost_with_offsets_integrated_out() -> None:
-    seen = landmarks_of(RIG, BODY, POSE, 0.002, visibility=1.0)
+BONES = [("shoulder_l", "shoulder_r"), ("hip_l", "hip_r")] + [
+    (a + side, b + side)
+    for a, b in (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))
+    for side in ("_l", "_r")
+]
+
+
+def sight(camera: Camera, seen: np.ndarray) -> np.ndarray:
+    """Direction from a camera to the middle of a person's landmarks (L, 4)."""
+    ray = np.append(camera.undistort(seen[:, :2]).mean(axis=0), 1.0)
+    return np.asarray(camera.rotation.T @ ray / np.linalg.norm(ray))
+
+
+@pytest.mark.parametrize("with_depth", [False, True])
+def test_gradient_is_that_of_the_cost_with_offsets_integrated_out(with_depth: bool) -> None:
+    seen = landmarks_of(RIG, BODY, POSE, 0.002, visibility=1.0, with_depth=with_depth)
     near = POSE + np.random.default_rng(2).normal(0.0, 0.003, len(POSE))
     found = LandmarkCue(RIG, BODY, seen).normal(near[None])
     gradient = found.matrix[0] @ near - found.linear[0]
     step = 1e-5 * np.eye(len(POSE))
     expected = [(marginal_cost(near + row, seen) - marginal_cost(near - row, seen)) / 2e-5 for row in step]
     np.testing.assert_allclose(gradient, expected, atol=0.02 * np.abs(expected).max())
+
+
+def test_depth_shows_whether_a_forearm_points_at_the_camera_or_away_from_it() -> None:
+    """Two poses of an arm that look alike in the only image."""
+    arm = [k for k, name in enumerate(NAMES) if name.startswith(("shoulder_l", "elbow_l"))]
+    poses = np.tile(POSE, (4000, 1))
+    poses[:, arm] += np.random.default_rng(5).uniform(-1.5, 1.5, (len(poses), len(arm)))
+    points = BODY.skeleton.joints(BODY.skeleton.clip(poses))
+    elbow, wrist = points[:, JOINTS.index("elbow_l")], points[:, JOINTS.index("wrist_l")]
+    pixels = np.concatenate([RIG[0].project(elbow)[0], RIG[0].project(wrist)[0]], axis=1)
+    depth = (wrist - elbow) @ RIG[0].rotation[2]
+    apart = np.linalg.norm(pixels[:, None] - pixels[None], axis=2)
+    apart[np.abs(depth[:, None] - depth[None]) < 0.3] = np.inf
+    pair = np.unravel_index(np.argmin(apart), apart.shape)
+    both = BODY.skeleton.clip(poses)[list(pair)]
+    for with_depth in (False, True):
+        for right in (0, 1):
+            seen = landmarks_of(RIG, BODY, both[right], with_depth=with_depth)
+            seen[1:] = np.nan
+            right_cost, other_cost = LandmarkCue(RIG, BODY, seen).score(both)[[right, 1 - right]]
+            assert (other_cost - right_cost > 1.5) == with_depth
+
+
+def test_unknown_depth_changes_nothing_and_depth_moves_left_and_right_with_the_landmarks() -> None:
+    seen = landmarks_of(RIG, BODY, POSE, 0.01, with_depth=True)
+    exchanged, pose = mirrored(seen), POSE[None]
+    own, other = (LandmarkCue(RIG, BODY, each).score(pose)[0] for each in (seen, exchanged))
+    # an exchange in all images costs its probability, and no more
+    assert other - own < INDEPENDENT * 2 * len(RIG) * np.log((1 - EXCHANGED) / EXCHANGED) + 1e-6
+    seen[..., 3] = np.nan
+    rows = LandmarkCue(RIG, BODY, seen).rows(pose)
+    assert not rows.information[:, len(LANDMARKS) :].any() and not rows.pull[:, len(LANDMARKS) :].any()
 
 
 def test_head_turns_to_where_the_face_is_seen_and_is_straight_without_it() -> None:

@@ -86,6 +86,7 @@ class ResultMeta:
     sigma: bool = False  # True if `/joints/sigma` exists
     residual_cameras: tuple[str, ...] = ()  # names of the C cameras of `/residual` and `/mask_source`
     landmark_names: tuple[str, ...] = ()  # names of the L landmarks; empty if no network sees landmarks
+    depth: bool = False  # True if `/landmark_depth` exists
     mask_sources: tuple[str, ...] = ()  # meanings of the values of `/mask_source`; empty if no segmenter makes masks
     reasons: tuple[str, ...] = ()  # meanings of the values of `/evidence/reason`
     judged: bool = False  # True if `/evidence/found` and `/evidence/origin` exist
@@ -202,8 +203,9 @@ class Result:
     created: str
     sigma: Float | None = None  # (F, J) metres, NaN for a joint without evidence
     mask_source: NDArray[np.uint8] | None = None  # (F, C), meanings in meta.mask_sources
-    # (F, C, L, 3) x, y, pixels of the recorded images, and visibility; NaN where no network was asked
+    # (F, C, L, 4) x, y, pixels of the recorded images, and visibility; NaN where no network was asked
     landmarks: NDArray[np.float32] | None = None
+    landmark_depth: NDArray[np.float32] | None = None
     reason: NDArray[np.uint8] | None = None  # (F,) why a frame is lost, suspect or without sigma, see meta.reasons
     found: NDArray[np.uint8] | None = None  # (F,) the reason that each frame itself shows, as ``reason``
     origin: NDArray[np.uint8] | None = None  # (F,) the status before the frame is judged

@@ -137,6 +137,12 @@ ROWS = (
         {"names": "landmark_names", "cameras": "residual_cameras"}, field="landmarks", optional="landmark_names",
     ),
     Dataset(
+        "landmark_depth", "F C L", "float32",
+        "metres by which each landmark is behind the middle of the hips along the line of sight, as the network "
+        "estimates it; NaN where it does not",
+        {"names": "landmark_names", "cameras": "residual_cameras"}, field="landmark_depth", optional="depth",
+    ),
+    Dataset(
         "evidence/reason", "F", "uint8", "why the frame is lost, suspect or without sigma",
         {"meaning": "reasons"}, field="reason", optional="reasons",
     ),

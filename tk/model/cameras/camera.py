@@ -239,7 +239,7 @@ class Rig:
         return Rig(tuple(camera.reduced(factor) for camera, factor in zip(self.cameras, factors, strict=True)))
 
     def recorded_pixels(self, landmarks: Float) -> Float:
-        """Return landmarks (..., C, L, 3), x and y in pixels of these cameras, in pixels of the recorded images."""
+        """Return landmarks (..., C, L, 4), x and y in pixels of these cameras, in pixels of the recorded images."""
         factor = np.array(self.reductions, np.float64)[:, None, None]
         result = np.array(landmarks, np.float64)
         result[..., :2] = (result[..., :2] + 0.5) * factor - 0.5

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.model.cameras.camera import Rig
-from tk.model.cues.landmarks import deviation, log_ratio, right_share
+from tk.model.cues.landmarks import deviation, known_landmarks, log_ratio, right_share
 
 Float = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ def evidence_for_cameras(rig: Rig, landmarks: Sequence[Float]) -> Float:
 
     Args:
         rig: C cameras.
-        landmarks: (N, C, L, 3) of N people in each of some frames: x, y, pixels, and visibility; NaN if unknown.
+        landmarks: (N, C, L, 4) of N people in each of some frames; NaN if unknown.
     """
     total, count = np.zeros(len(rig)), np.zeros(len(rig))
     for people in landmarks:
@@ -47,7 +47,7 @@ def evidence_for_cameras(rig: Rig, landmarks: Sequence[Float]) -> Float:
 
 
 def associated(rig: Rig, landmarks: Float) -> Float:
-    """Return landmarks (N, C, L, 3) of N people with each image's sets of landmarks given to the people whom they show.
+    """Return landmarks (N, C, L, 4) of N people with each image's sets of landmarks given to the people whom they show.
 
     A network that is asked for a person behind another one may show the one in front. A set that fits nobody is
     dropped. A person on whom no two other images agree keeps the set, because it cannot be tested.
@@ -79,7 +79,7 @@ class Consensus(NamedTuple):
 
 
 def consensus(rig: Rig, seen: Float) -> Consensus:
-    """Return the cameras whose landmarks, of (C, L, 3), show one person.
+    """Return the cameras whose landmarks, of (C, L, 4), show one person.
 
     Each pair of cameras proposes points; those with the highest likelihood in all cameras are the person's, so people
     who stand close together are separated. Without a pair that agrees, no camera is returned.
@@ -100,8 +100,8 @@ class _Sets(NamedTuple):
 
     @staticmethod
     def of(rig: Rig, seen: Float) -> _Sets:
-        """Return the sets (S, L, 3) of S cameras, pixels and visibility; NaN if unknown."""
-        known = np.asarray(np.isfinite(seen).all(axis=-1))
+        """Return the sets (S, L, 4) of S cameras; NaN if unknown."""
+        known = known_landmarks(seen)
         at, rays = np.zeros((*known.shape, 2)), np.zeros((*known.shape, 3))
         for k, camera in enumerate(rig):
             at[k, known[k]] = camera.undistort(seen[k, known[k], :2])

@@ -76,11 +76,13 @@ def triangulate_joints(rig: Rig, joints: Float) -> tuple[Float, NDArray[np.bool_
 
     Args:
         rig: C cameras.
-        joints: (C, J, 3) pixels x, y and confidence of one person; NaN where a joint is not visible.
+        joints: (C, J, 3 or more) pixels x, y and confidence of one person; NaN where a joint is not visible. Further
+            columns do not count.
 
     Returns:
         Points (J, 3), metres, NaN where no two cameras agree; and (C, J) bool, the inliers.
     """
+    joints = joints[..., :3]
     rays = _Triangulator(rig)
     C, J = joints.shape[:2]
     seen = np.stack([rays.normalised(c, joints[c, :, :2]) for c in range(C)])

@@ -38,7 +38,7 @@ class Pyramid:
     # `tk.kernels.mask_values.OTHERS`.
     masks: tuple[Masks, ...]
     sizes: tuple[NDArray[np.int32], ...]  # (V, 2) for each scale, width and height of each camera's image
-    # (V, L, 3), or (F, V, L, 3) of F frames: x, y, pixels, and visibility of the person's landmarks; None without any
+    # (V, L, 4), or (F, V, L, 4) of F frames: the person's landmarks, see tk.model.cues.landmarks; None without any
     landmarks: Float | None = None
 
     @staticmethod
@@ -57,7 +57,7 @@ class Pyramid:
 
 
 def all_landmarks(each: Sequence[Float | None]) -> Float | None:
-    """Return the landmarks of F frames, (V, L, 3) or None each, as (F, V, L, 3); None if no frame has any."""
+    """Return the landmarks of F frames, (V, L, 4) or None each, as (F, V, L, 4); None if no frame has any."""
     known = [one for one in each if one is not None]
     if not known:
         return None
@@ -78,7 +78,7 @@ class Views:
         self.sizes = np.array([(c.width, c.height) for c in rig], np.int32)
 
     def pyramid(self, masks: Masks, scales: int, cleaning: bool, landmarks: Float | None = None) -> Pyramid:
-        """Return the scales of masks (V, H, W), cleaned if ``cleaning``, with landmarks (V, L, 3)."""
+        """Return the scales of masks (V, H, W), cleaned if ``cleaning``, with landmarks (V, L, 4)."""
         # everything happens inside boxes around the people
         crops = [(slice(y, y + h), slice(x, x + w)) for x, y, w, h in map(cv2.boundingRect, masks)]
         shared = any((mask[crop] == OTHERS).any() for mask, crop in zip(masks, crops, strict=True))
