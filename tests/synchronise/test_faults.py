@@ -76,6 +76,13 @@ def test_wrong_rate_of_a_file_is_named(known: bool) -> None:
     assert camera == 1 and "its motion is 1.2 times slower than that of the others" in text
 
 
+def test_camera_that_is_synchronised_is_not_blamed_for_one_that_is_not() -> None:
+    one, two, three = motion()
+    at = np.arange(0, len(two) - 1, 1 / 1.2)
+    slow = np.stack([np.interp(at, np.arange(len(two)), column) for column in two.T], axis=1)
+    assert motion_fault([one, slow, np.roll(three, 9 * GRID_HZ, axis=0)], (0.0, 0.0, np.nan)) == {}
+
+
 def test_chapters_in_another_order_are_named() -> None:
     one, two, three = motion()
     half = len(two) // 2

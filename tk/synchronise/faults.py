@@ -48,7 +48,7 @@ SURE = 0.999
 
 def other_speed_or_order(recordings: Sequence[Recording], signals: Sequence[Signals], clocks: Clocks) -> dict[int, str]:
     """Return why the motion of a camera fits the others at another speed, or in a part at another lag only: the camera
-    that contradicts most, if one does.
+    that contradicts most, if one does. Where cameras are not synchronised, the fault is in one of these.
 
     Args:
         recordings: the cameras.
@@ -56,7 +56,8 @@ def other_speed_or_order(recordings: Sequence[Recording], signals: Sequence[Sign
         clocks: those of the cameras that are synchronised.
     """
     found: list[tuple[float, int, str]] = []
-    for c, recording in enumerate(recordings):
+    for c in np.flatnonzero(~clocks.connected).tolist() or range(len(recordings)):
+        recording = recordings[c]
         compared = _with_others(c, signals, clocks)
         if compared is None:
             continue
