@@ -29,7 +29,7 @@ LOOKED_S, _MOST_HZ = 180.0, 62.0
 #: which a change counts no more: reflections
 _MOVES, _MOST = 3.0, 40.0
 #: of a long recording, to find the person: seconds between key images; grey levels, and share of an image, that differ
-#: while somebody is there; seconds before that
+#: while somebody is there (half and twice that share find the same frozen pictures); seconds before that
 _KEYS_S, _DIFFERS, SOMEBODY, _BEFORE_S = 5.0, 18.0, 0.003, 30.0
 #: grey levels by which coding changes the small images of one picture; the noise of a camera is more
 _CODING = 8
