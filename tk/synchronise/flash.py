@@ -119,7 +119,7 @@ def compare_events(looks: Sequence[Look]) -> list[Tie]:
     changes = _same_changes(links)
     first = {k: min(events[c][n].own_s for c, n in change.items()) for k, change in enumerate(changes)}
     for _, group in groupby(sorted(first, key=lambda k: first[k]), lambda k: first[k] // _TOGETHER_S):
-        ties += _ties([{c: events[c][n] for c, n in changes[k].items()} for k in group])
+        ties += ties_of_changes([{c: events[c][n] for c, n in changes[k].items()} for k in group])
     return ties
 
 
@@ -172,7 +172,7 @@ def _match(one: Sequence[Event], other: Sequence[Event]) -> list[tuple[int, int]
     return best
 
 
-def _ties(changes: Sequence[Mapping[int, Event]]) -> list[Tie]:
+def ties_of_changes(changes: Sequence[Mapping[int, Event]]) -> list[Tie]:
     """Return ties between the first and the other cameras that some changes of the light give together.
 
     The unknowns are the instants of the changes, and each camera's offset and exposure. Samples of them are drawn in

@@ -27,6 +27,9 @@ Float = NDArray[np.float64]
 GRID_HZ = 120
 #: seconds that two recordings must have in common
 LEAST_S = 2.0
+#: seconds by which a lag may differ from the best one and be the same: twice the width of most motions. Twice as many
+#: change no answer of :mod:`tk.synchronise.faults`; with half of it, one of 11 right folders has a false speed.
+NEAR_S = 0.35
 #: planes of a pair of cameras; share of the motion beyond the planes at each end
 _PLANES, _BEYOND = 48, 0.01
 #: least sine of the angle between a ray and the line through both cameras: beside it, planes are not determined
@@ -141,11 +144,11 @@ def rays_of(look: Look, camera: Camera, mirrored: bool) -> Float:
     return np.asarray(rays[:, ::-1] if mirrored else rays)
 
 
-def _profiles(
+def shared_planes(
     a: Look, b: Look, rays_a: Float, rays_b: Float, center_a: Float, center_b: Float
-) -> tuple[tuple[float, Float], tuple[float, Float], float] | None:
-    """Return the motion in each plane through the centres, (N, P) on the grid, for both cameras, and the sine of
-    :class:`Compared`; None if they share too few planes."""
+) -> tuple[NDArray[np.int64], NDArray[np.int64], float] | None:
+    """Return for each pixel (h, w) of both cameras the plane through both centres in which it lies, -1 if it lies in
+    none, and the sine of :class:`Compared`; None if what moves lies in too few planes of both."""
     base = center_b - center_a
     base = base / np.linalg.norm(base)
     side = np.cross(base, np.eye(3)[np.argmin(np.abs(base))])
@@ -156,7 +159,7 @@ def _profiles(
         angles.append(np.arctan2(rays @ third, rays @ side))
         sine = np.linalg.norm(np.cross(rays, base), axis=2)
         usable.append(sine > _LEAST_SINE)
-        totals.append(np.where(usable[-1], look.changes.sum(axis=0), 0.0))
+        totals.append(np.where(usable[-1], look.moved, 0.0))
         means.append(float((sine * totals[-1]).sum() / max(totals[-1].sum(), 1e-9)))
     if not all(total.any() for total in totals):
         return None
@@ -167,15 +170,34 @@ def _profiles(
     if high - low < 0.3 * max(r[1] - r[0] for r in ranges):
         return None
     found = []
-    for look, angle, use in zip((a, b), angles, usable, strict=True):
+    for angle, use in zip(angles, usable, strict=True):
         plane = np.floor((angle - low) / (high - low) * _PLANES).astype(int)
-        inside = use & (plane >= 0) & (plane < _PLANES)
-        which = plane[inside]
-        sums = np.stack([np.bincount(which, change[inside], _PLANES) for change in look.changes])
-        sums = np.sqrt(gaussian_filter1d(sums, 1.0, axis=1) / np.diff(look.times_s)[:, None])
-        start, grid = on_grid(look.middles_s, sums)
-        found.append((start, grid - grid.mean(axis=0)))
+        found.append(np.where(use & (plane >= 0) & (plane < _PLANES), plane, -1))
     return found[0], found[1], min(means)
+
+
+def planes_sum(motion: NDArray[np.float32], planes: NDArray[np.int64]) -> Float:
+    """Return (N, P) the root of the motion (N, h, w) in each plane; ``planes`` (h, w) as in :func:`shared_planes`."""
+    inside = planes >= 0
+    which = planes[inside]
+    sums = np.stack([np.bincount(which, change[inside], _PLANES) for change in motion])
+    return np.asarray(np.sqrt(gaussian_filter1d(sums, 1.0, axis=1)))
+
+
+def _profiles(
+    a: Look, b: Look, rays_a: Float, rays_b: Float, center_a: Float, center_b: Float
+) -> tuple[tuple[float, Float], tuple[float, Float], float] | None:
+    """Return the motion in each plane through the centres, (N, P) on the grid, for both cameras, and the sine of
+    :class:`Compared`; None if they share too few planes."""
+    shared = shared_planes(a, b, rays_a, rays_b, center_a, center_b)
+    if shared is None:
+        return None
+    found = []
+    for look, planes in zip((a, b), shared[:2], strict=True):
+        sums = planes_sum(look.changes, planes)
+        start, grid = on_grid(look.middles_s, sums / np.sqrt(np.diff(look.times_s))[:, None])
+        found.append((start, grid - grid.mean(axis=0)))
+    return found[0], found[1], shared[2]
 
 
 def _quantiles(values: Float, weights: Float) -> tuple[float, float]:
@@ -213,7 +235,7 @@ def align(pairs: Sequence[Compared], count: int, intervals_s: Sequence[float], k
             if score > best[0]:
                 best = score, placed
     placed = best[1]
-    beside = round(max(0.35, 3 * max(intervals_s)) * GRID_HZ)
+    beside = round(max(NEAR_S, 3 * max(intervals_s)) * GRID_HZ)
     groups = tuple(_certain(frozenset(placed), by_pair, placed, beside))
     ties = [
         _tie(by_pair[i, j], placed[i] - placed[j], intervals_s, kind) for group in groups

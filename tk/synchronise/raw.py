@@ -68,6 +68,11 @@ class Recording:
         return float(self.times_s[0]), float(self.times_s[-1]) + self.interval_s
 
     @property
+    def begins_s(self) -> list[float]:
+        """Own times at which its files begin, seconds."""
+        return [float(self.times_s[0]) + shift for shift in self.shifts_s]
+
+    @property
     def dropped(self) -> int:
         """Number of images that are missing: gaps of about a whole number of intervals."""
         gaps = np.rint(np.diff(self.times_s) / self.interval_s)

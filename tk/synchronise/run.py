@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError, VideoError
 from tk.model.cameras.camera import Camera
 from tk.synchronise.decide import Decision, decide, timecode_ties
-from tk.synchronise.faults import exchanged, other_speed_or_order, sound_in_other_order, still_parts
+from tk.synchronise.faults import (
+    SURE,
+    exchanged,
+    other_speed_or_order,
+    sound_in_other_order,
+    still_parts,
+    unchecked_chapters,
+)
 from tk.synchronise.flash import compare_events
 from tk.synchronise.looks import LOOKED_S, Look, first_motion, look_at
 from tk.synchronise.person import Compared, align, compare_planes, compare_signals, signals_of
@@ -117,16 +124,24 @@ def synchronise(
     clocks = decision.clocks
     if not clocks.connected[1:].any():  # the first camera may be the wrong one: the others are compared
         clocks = max((solve(count, ties, root) for root in range(count)), key=lambda each: int(each.connected.sum()))
-    faulty = other_speed_or_order(recordings, looks, signals, clocks) | faulty
-    if cameras and not faulty and (pair := exchanged(recordings, looks, cameras, decision.clocks)):
-        faulty[pair[0]] = (
-            f"its video and that of {recordings[pair[1]].name} look exchanged: what moves is then at one place for all "
-            "cameras; exchange the names of both"
-        )
+    faulty = other_speed_or_order(recordings, signals, clocks) | faulty
+    if cameras and not faulty and (places := exchanged(recordings, looks, cameras, decision.clocks)):
+        right, (a, b) = places
+        if right < 1 - SURE:
+            faulty[a] = (
+                f"its video and that of {recordings[b].name} look exchanged: what moves is then at one place for all "
+                "cameras; exchange the names of both"
+            )
+        elif right < SURE:
+            decision.notes.append(
+                f"{recordings[a].where}: the motion does not tell whether its video and that of {recordings[b].name} "
+                f"are exchanged (probability {1 - right:.2g}); compare both with the calibration in tk inspect"
+            )
     decision.notes.extend(
         f"{recordings[c].where}: {_OTHER_SOUND} than that of the others; {decision.methods[c]} alone gives its offset"
         for c in range(count) if _OTHER_SOUND in reasons[c] and linked.sum() > 1 and decision.methods[c]
     )  # fmt: skip
+    decision.notes.extend(unchecked_chapters(recordings, signals, clocks, ties))
     decision.notes.extend(still_parts(recordings, looks, clocks))
     decision.faulty.update(faulty)
     return Synchronised(recordings, decision, looks, mirrored)
