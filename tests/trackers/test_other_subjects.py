@@ -22,7 +22,7 @@ POSES = walk(3)
 MASKS = draw_silhouettes(BODY, RIG, POSES)
 # in the first camera another person hides the legs
 IN_FRONT = np.zeros(MASKS.shape[1:], bool)
-IN_FRONT[0, RIG.frame_shape[0] * 55 // 100 :] = True
+IN_FRONT[0, RIG.frame_shape[0] * 60 // 100 :] = True
 MARKED, CUT = (np.where(IN_FRONT, np.uint8(value), MASKS) for value in (OTHERS, 0))
 
 

@@ -183,13 +183,11 @@ class _Finisher:
     def _second_pass(self, member: Member, tracker: TwoPassTracker, masks: MaskStore, draft: _Draft) -> TwoPassTracker:
         """Optimise the poses of a draft by what all frames show. Return the tracker with the final cameras and body.
 
-        The body is fitted to frames of the whole recording unless that began with the initialisation pose.
+        The body is fitted to frames of the whole recording: only bent elbows and knees show where these are.
         """
         subject = member.subject
-        first = tracker
         if self.alone and subject.init is None:  # a given pose shows where the front is
             tracker = self._with_true_heading(tracker, masks, draft, subject.height_m)
-        turned = tracker is not first
         tracker, masks = self._with_final_cameras(member, tracker, masks, draft)
         _LOG.info("second pass")
         poses, residual, precise = tracker.second_pass(
@@ -199,9 +197,7 @@ class _Finisher:
             draft.current("residual"),
             subject.height_m,
             self._landmarks(draft, self._late),
-            # in the initialisation pose every limb is visible; other first poses may hide limbs, and so may others
-            keep_body=subject.body is not None
-            or (self.alone and subject.init is None and subject.in_init_pose and not turned),
+            keep_body=subject.body is not None,
             report=self.within,
         )
         sigma = sigma_of_both(draft.current("evidence/sigma"), precise)

@@ -158,7 +158,7 @@ def track_again(
             seen = monitor.start(opening)
             if first.left_out().any():
                 given = dict(zip(tracker.pose_names, pose.tolist(), strict=True))
-                init = InitPose({}, given, height_m=subject.height_m or tracker.body.dimensions.stature)
+                init = InitPose({}, given, height_m=subject.height_m or tracker.body.dimensions.barefoot)
                 tracker.start(seen, replace(subject, init=init))
         except CaptureError:
             return None

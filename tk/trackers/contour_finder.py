@@ -203,7 +203,7 @@ class ContourFinder:
             hypotheses = find_person(self, seen, rough)
         if not self.contours.adapt or subject.body is not None:
             return np.asarray(hypotheses[0].poses[0])
-        return self._adapt(frames, pyramids, hypotheses, average.stature, stature is not None)
+        return self._adapt(frames, pyramids, hypotheses, average.barefoot, stature is not None)
 
     @contextmanager
     def _opening_cameras(

@@ -229,7 +229,7 @@ class RegionTracker(ContourTracker[RegionState]):
         for i, (shown, pyramid) in enumerate(zip(masks, seen, strict=True)):
             frame = Frame(i, np.empty((len(shown), 0, 0, 3), np.uint8), shown)
             both[i, 1] = self.improved(self.see(frame, pyramid=pyramid), both[i, 1])
-        stature = height_m or self.body.dimensions.stature
+        stature = height_m or self.body.dimensions.barefoot
         deviation = STATURE_DEVIATION if height_m else STATURE
         trackers, costs = (self.with_cameras(self.rig), self.with_cameras(self.rig)), []
         for tracker, one in zip(trackers, both.swapaxes(0, 1), strict=True):

@@ -14,7 +14,9 @@ NAMES = [f.name for f in fields(BodyDimensions)]
 @pytest.mark.parametrize("stature", [1.1, 1.5, 1.75, 2.1])
 def test_average_body_has_the_given_stature(stature):
     """The segments of a standing person add up, to the rounding of the table and a shoe's sole."""
-    assert -0.005 < BodyDimensions.from_stature(stature).stature / stature - 1 < 0.02
+    body = BodyDimensions.from_stature(stature)
+    assert -0.005 < body.stature / stature - 1 < 0.02
+    assert body.barefoot == pytest.approx(stature)
 
 
 def test_every_dimension_is_proportional_to_the_stature():

@@ -172,6 +172,14 @@ def test_lengths_of_a_known_body_are_recovered(monkeypatch):
     assert found.dimensions.stature == pytest.approx(true.stature, rel=0.01)
 
 
+@pytest.mark.parametrize("wrong", [0.96, 1.04])
+def test_silhouettes_outweigh_a_wrong_height(wrong: float) -> None:
+    poses = walk(AVERAGE, 4)
+    true = AVERAGE.dimensions.barefoot
+    found, _, _ = fit_body(VIEWS, pyramids_of(AVERAGE, poses), poses, SEARCH, true * wrong)
+    assert abs(found.dimensions.barefoot / true - 1) < 0.6 * abs(wrong - 1)
+
+
 def test_landmarks_show_joints_that_silhouettes_of_straight_limbs_do_not():
     """Upper arms are longer and forearms shorter than average; the arms hang straight."""
     body = build_cone_body(scaled(AVERAGE.dimensions, upper_arm=1.12, forearm=0.88))

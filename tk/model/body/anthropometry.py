@@ -24,9 +24,9 @@ FRACTIONS = {
     "shoulder_drop": 0.044,  # shoulder centres below C7/T1, the arms level
     "shoulder_half_width": 0.106,  # glenohumeral centre to the median plane
     "hip_half_width": 0.060,  # hip centre to the median plane
-    "upper_arm": 0.149,
+    "upper_arm": 0.160,  # de Leva; Drillis & Contini have 0.186, from the acromion
     "forearm": 0.149,
-    "hand": 0.108,  # wrist to the tip of the middle finger
+    "hand": 0.100,  # wrist to the tip of the middle finger, relaxed; 0.108 with straight fingers
     "thigh": 0.245,
     "calf": 0.246,
     "ankle_height": 0.049,  # ankle centre above the sole of a shoe; 0.039 barefoot
@@ -44,6 +44,9 @@ FRACTIONS = {
     "knee_radius": 0.036,
     "ankle_radius": 0.025,
 }
+
+#: dimensions that add up to the stature
+UPRIGHT = ("head", "trunk", "thigh", "calf", "ankle_height")
 
 # Rise of a shoulder when its arm goes from hanging to level, as a fraction of the stature: the collar bone then points
 # up by 5 to 10° more (Ludewig et al., J. Bone Joint Surg. Am. 91, 2009, 378-389), 2 to 3 cm at its end.
@@ -112,13 +115,18 @@ class BodyDimensions:
 
     @staticmethod
     def from_stature(stature_m: float) -> BodyDimensions:
-        """Return the dimensions of the average body of a stature (crown to sole), metres."""
+        """Return the dimensions of the average body of a stature (crown to floor without shoes), metres."""
         return BodyDimensions(**{name: fraction * stature_m for name, fraction in FRACTIONS.items()})
 
     @property
     def stature(self) -> float:
-        """Crown to sole when standing, metres."""
+        """Crown to the sole of the shoes when standing, metres."""
         return self.head + self.trunk + self.thigh + self.calf + self.ankle_height
+
+    @property
+    def barefoot(self) -> float:
+        """Crown to floor when standing without shoes, metres: the average body's with this :attr:`stature`."""
+        return self.stature / sum(FRACTIONS[name] for name in UPRIGHT)
 
 
 #: names of the dimensions

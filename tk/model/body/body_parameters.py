@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tk.kernels.cones import CONE
 from tk.kernels.silhouette import Edgels
-from tk.model.body.anthropometry import DIMENSIONS, BodyDimensions
+from tk.model.body.anthropometry import DIMENSIONS, UPRIGHT, BodyDimensions
 from tk.model.body.body_points import SEGMENT, places
 from tk.model.body.cone_body import SHAPE_NUMBERS, ConeBody, ConePart, build_cone_body, group_of, part_arrays
 from tk.model.body.skeleton import build_skeleton
@@ -24,17 +24,16 @@ from tk.model.body.skeleton import build_skeleton
 Float = NDArray[np.float64]
 
 # Prior standard deviation of a dimension's logarithm about the proportions of the stature. Lengths between joints vary
-# by 4 to 5 % at a given stature (Drillis & Contini 1966). Radii vary with girth and clothes; so do the ends of the body
-# and the shoulder's drop, which both sources define loosely. Mean errors of walk and dance (60 frames) change by less
-# than 0.1 cm with radii of half and twice the value and with half the values of the lengths; twice these costs 0.3 cm.
+# by 4 to 5 % at a given stature (Drillis & Contini 1966); definitions of the shoulder's centre differ by more.
+# Fingers may be bent. Radii vary with girth and clothes; so do the ends of the body and the shoulder's drop, which both
+# sources define loosely. Mean errors of walk and dance (60 frames) change by less than 0.1 cm with radii of half and
+# twice the value and with half the values of the lengths; twice these costs 0.3 cm.
 _LENGTHS = (
-    dict.fromkeys(("trunk", "head", "upper_arm", "forearm", "thigh", "calf"), 0.05)
+    dict.fromkeys(("trunk", "head", "forearm", "thigh", "calf"), 0.05)
     | dict.fromkeys(("foot", "shoulder_half_width", "hip_half_width"), 0.06)
-    | dict.fromkeys(("hand", "ankle_height"), 0.1)
-    | {"shoulder_drop": 0.25}
+    | {"upper_arm": 0.08, "ankle_height": 0.1, "hand": 0.15, "shoulder_drop": 0.25}
 )
 _RADII = 0.2
-_STATURE = ("head", "trunk", "thigh", "calf", "ankle_height")  # dimensions that add up to the stature
 
 # Prior standard deviation of a part's shape: logarithms of a, b, m and h about the values that follow from the
 # dimensions, and metres off the bone along x and y at the beginning and at the end of the axis. Parts between joints
@@ -126,9 +125,9 @@ class BodyFamily:
         H += np.diag(self.deviation**-2)
         g += (self.mean - shared) / self.deviation**2
         lengths = dict(zip(DIMENSIONS, np.exp(shared[: len(DIMENSIONS)]), strict=True))
-        stature = sum(lengths[name] for name in _STATURE)
+        stature = sum(lengths[name] for name in UPRIGHT)
         row = np.zeros(len(shared))
-        for name in _STATURE:
+        for name in UPRIGHT:
             row[DIMENSIONS.index(name)] = lengths[name] / stature / self.stature_deviation
         H += np.outer(row, row)
         g += row * np.log(self.average.stature / stature) / self.stature_deviation
