@@ -188,7 +188,7 @@ def test_result_without_a_body_and_bad_options_are_refused(tiny: Path, tracked: 
     bare = tmp_path / "bare.h5"
     shutil.copy(tracked, bare)
     with h5py.File(bare, "r+") as file:
-        del file["model"]
+        del file["people/0/model"]
     tk("calibrate", tiny, "--refine", bare, "-o", output).complaint(str(bare), "no body with contours")
     tk("calibrate", tiny, "--refine", tracked, "-o", output, "--trust", "0").complaint("trust = 0")
     assert not output.exists()

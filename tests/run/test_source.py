@@ -144,13 +144,12 @@ def test_frames_before_the_first_person_are_absent_and_the_others_as_if_tracking
     reporter, late = Silent(), tmp_path / "late.h5"
     summary = track_task(task(SETUP, LATE, people=people), late, reporter)
     result = read_result(late)
-    absent = 0 if people == "all" else EMPTY  # of several people, only frames with a person have rows
-    assert (result.status == Status.ABSENT).tolist() == absent * [True] + len(POSES) * [False]
+    assert (result.status == Status.ABSENT).tolist() == EMPTY * [True] + len(POSES) * [False]
     assert summary.present == len(POSES) and reporter.frames == list(range(EMPTY + len(POSES)))
     assert reporter.notes == [f"frame {EMPTY}: the first person has entered"]
     for name in ("pose", "joints", "sigma", "status"):
-        np.testing.assert_array_equal(getattr(result, name)[absent:], getattr(begun, name), err_msg=name)
-    assert np.isfinite(result.joints).all()
+        np.testing.assert_array_equal(getattr(result, name)[EMPTY:], getattr(begun, name), err_msg=name)
+    assert np.isfinite(result.joints).any(axis=(1, 2)).tolist() == EMPTY * [False] + len(POSES) * [True]
 
 
 @pytest.mark.parametrize("stop", [EMPTY - 2, EMPTY + 1])
@@ -342,20 +341,22 @@ def second(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, tuple[Subj
 
 def test_somebody_who_enters_gets_a_number_and_who_leaves_is_absent(everybody: tuple[Result, ...]) -> None:
     first, second = everybody
-    np.testing.assert_array_equal(first.frames, np.arange(ENTERING))
-    assert not (first.status == Status.LOST).any()
-    np.testing.assert_array_equal(second.frames, np.arange(second.frames[0], 17))
-    assert 3 < second.frames[0] < 16 and not (second.status == Status.LOST).any()
+    assert not (first.status >= Status.LOST).any()
+    (here,) = np.nonzero(second.status != Status.ABSENT)
+    np.testing.assert_array_equal(here, np.arange(here[0], 17))
+    assert 3 < here[0] < 16 and not (second.status == Status.LOST).any()
     for own, result in zip(ENTER, (first, second), strict=True):
-        joints = np.array([BODY.skeleton.joints(pose) for pose in own[result.frames]])
-        assert np.median(np.linalg.norm(result.joints - joints, axis=2)) < 0.1  # coarse settings
+        np.testing.assert_array_equal(result.frames, np.arange(ENTERING))
+        joints = np.array([BODY.skeleton.joints(pose) for pose in own])
+        assert np.nanmedian(np.linalg.norm(result.joints - joints, axis=2)) < 0.1  # coarse settings
 
 
 def test_somebody_who_enters_later_can_be_chosen(second: tuple[Result, tuple[Subject, ...]]) -> None:
     found, subjects = second
     np.testing.assert_array_equal(found.frames, np.arange(ENTERING))
     (here,) = np.nonzero(found.status != Status.ABSENT)
-    assert 3 < here[0] < 16 and not (found.status == Status.LOST).any() and np.isfinite(found.pose).all()
+    assert 3 < here[0] < 16 and not (found.status == Status.LOST).any()
+    np.testing.assert_array_equal(np.isfinite(found.pose).all(axis=1), found.status != Status.ABSENT)
     np.testing.assert_array_equal(here, np.arange(here[0], 17))
     joints = np.array([BODY.skeleton.joints(pose) for pose in ENTER[1][here]])
     assert np.median(np.linalg.norm(found.joints[here] - joints, axis=2)) < 0.1  # coarse settings

@@ -203,7 +203,7 @@ def test_a_run_killed_in_its_second_pass_repeats_it_on_resume(
     result = tmp_path / "r.h5"
     shutil.copyfile(causal, result)
     with h5py.File(result, "r+") as file:  # what the end of a causal run adds
-        del file["smoothed"]
+        del file["people/0/smoothed"]
         del file["cameras"]
     caplog.set_level(logging.INFO, "tk")
     summary = run(tiny, result, resume=True)
@@ -384,13 +384,13 @@ def test_results_without_a_cone_body_are_refused(
     command = ["track", tiny, "-o", tmp_path / "r.h5", "--config", quick]
     older = Path(shutil.copy(tracked, tmp_path / "older.h5"))
     with h5py.File(older, "r+") as file:
-        del file["model/parts"]
+        del file["people/0/model/parts"]
     tk(*command, "--body", older).complaint("older.h5", "no body of contours", "the method region")
     tk(*command, "--body", tmp_path / "none.h5").complaint("none.h5")
     tk(*command, "--body", tmp_path / "none.toml").complaint("none.toml")
     damaged = Path(shutil.copy(causal, tmp_path / "damaged.h5"))
     with h5py.File(damaged, "r+") as file:
-        del file["model/parts/name"]
+        del file["people/0/model/parts/name"]
     tk(*command, "--body", damaged).complaint("damaged.h5", "the body cannot be used")
     damaged.unlink()
     older.unlink()

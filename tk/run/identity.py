@@ -118,12 +118,11 @@ def exchanged(people: Sequence[Result], contacts: Sequence[Contact]) -> tuple[Re
     for contact in contacts:
         if contact.outcome != EXCHANGED:
             continue
-        a, b = contact.people
-        frames = np.intersect1d(found[a].frames, found[b].frames)
-        frames = frames[(frames >= contact.moment) & (frames <= contact.last)]
-        rows = {n: np.searchsorted(found[n].frames, frames) for n in (a, b)}
-        of_a, of_b = found[a], found[b]
-        found[a], found[b] = _with_rows(of_a, rows[a], of_b, rows[b]), _with_rows(of_b, rows[b], of_a, rows[a])
+        of_a, of_b = (found[n] for n in contact.people)
+        there = (of_a.status != Status.ABSENT) & (of_b.status != Status.ABSENT)
+        rows = np.flatnonzero(there & (of_a.frames >= contact.moment) & (of_a.frames <= contact.last))
+        for n, mine, other in zip(contact.people, (of_a, of_b), (of_b, of_a), strict=True):
+            found[n] = _with_rows(mine, other, rows)
     return tuple(found)
 
 
@@ -169,13 +168,14 @@ def exchanged_masks(
     return result
 
 
-def _with_rows(to: Result, rows: NDArray[np.int64], source: Result, other: NDArray[np.int64]) -> Result:
+def _with_rows(to: Result, source: Result, rows: NDArray[np.int64]) -> Result:
+    """Return a result with some rows of another one."""
     columns: dict[str, Any] = {}
     for name in COLUMNS.values():
         values = getattr(to, name)
         if values is not None:
             columns[name] = values.copy()
-            columns[name][rows] = getattr(source, name)[other]
+            columns[name][rows] = getattr(source, name)[rows]
     for name in {"status", "origin"} & columns.keys():
         columns[name][rows[columns[name][rows] == Status.INITIALISED]] = Status.TRACKED
     return replace(to, **columns)

@@ -80,21 +80,23 @@ def finish(
     members, contacts = people.members, people.contacts
     cameras = UsedCameras(task.setup.rig, np.array(task.source.time_offset_s))
     finisher = _Finisher(task, len(members) == 1, note, within, cameras)
-    results = exchanged(found, contacts)
+    held = [_held(person) for person in found]
+    results = exchanged(held, contacts)
     for line in report(contacts):
         note(line)
     revisions = {}
     for member in members:
         result, number = results[member.number], member.number
+        absent = result.status == Status.ABSENT
         if not people.has_segments:
             _report(result.frames, result.reason, note, number, finisher.alone)
             continue
         draft = _Draft(result, ~result.has_pose, result.has_pose & doubtful(result, contacts))
-        if result is not found[number]:
+        if result is not held[number]:
             columns = {dataset: getattr(result, name) for dataset, name in COLUMNS.items()}
             draft.columns = {dataset: values for dataset, values in columns.items() if values is not None}
         own = None if masks is None else exchanged_masks(number, contacts, masks, result.frames)
-        revisions[number] = finisher.finish(member, draft, own)
+        revisions[number] = _without(finisher.finish(member, draft, own), absent)
         _report(result.frames, draft.current("evidence/reason"), note, number, finisher.alone)
     return Finished(revisions, finisher.cameras.recorded() if revisions else None)
 
@@ -168,7 +170,11 @@ class _Finisher:
     def _complete(self, masks: MaskStore, person: int, tracker: TwoPassTracker, result: Result) -> bool:
         """Return whether a person's masks of all frames are known. Those that an earlier run has used are made again if
         nobody else is tracked."""
-        missing = [int(f) for f in result.frames if int(f) not in masks]
+        absent = result.status == Status.ABSENT
+        for frame in result.frames[absent].tolist():
+            if frame not in masks:
+                masks.put(frame, np.zeros((len(self.task.setup.rig), *self.task.setup.rig.frame_shape), np.uint8))
+        missing = [frame for frame in result.frames[~absent].tolist() if frame not in masks]
         if missing and not self.alone:
             self.note(
                 f"person {person}: the second pass is omitted, because an earlier run kept no masks of each person"
@@ -384,6 +390,28 @@ def sigma_of_both(first: Float, second: Float) -> Float:
     """Return sigma (F, J), metres, of the second pass, or of the first one where that is much larger or NaN: it tracked
     several poses, or did not find a limb."""
     return np.where(first <= _LESS_SURE * second, second, first)
+
+
+def _held(result: Result) -> Result:
+    """Return a result in which frames without a pose have that of the last frame before, or of the first one."""
+    known = np.isfinite(result.pose).all(axis=1)
+    rows = np.maximum.accumulate(np.where(known, np.arange(len(result)), int(np.argmax(known))))
+    return replace(result, pose=result.pose[rows], joints=result.joints[rows])
+
+
+def _without(revision: Revision, absent: NDArray[np.bool_]) -> Revision:
+    """Return a revision with NaN in the frames (F,) in which the person is absent and that are not bridged."""
+
+    def blank(columns: Mapping[str, Any], rows: Any) -> dict[str, NDArray[Any]]:
+        found = {name: np.array(values) for name, values in columns.items()}
+        for values in found.values():
+            if values.dtype.kind == "f":
+                values[rows] = np.nan
+        return found
+
+    assert revision.smoothed is not None
+    gaps = np.asarray(absent & ~np.asarray(revision.smoothed["bridged"]))
+    return replace(revision, columns=blank(revision.columns, absent), smoothed=blank(revision.smoothed, gaps))
 
 
 def _report(frames: NDArray[np.int64], reasons: NDArray[np.uint8] | None, note: Note, person: int, alone: bool) -> None:

@@ -145,12 +145,6 @@ class People:
         return self._first.has_segments
 
     @property
-    def several(self) -> bool:
-        """Whether the result may have several people: each then has rows only for frames in which the person is
-        present."""
-        return self._choice == "all" or (self._choice != "auto" and len(self._choice) > 1)
-
-    @property
     def _awaited(self) -> set[int]:
         """Numbers, as `tk inspect` prints them, of chosen people who have not entered yet."""
         return set(self._choice) - self._given if isinstance(self._choice, tuple) and self._given is not None else set()
@@ -325,10 +319,9 @@ class People:
     # --- one frame ----------------------------------------------------------------------------------------------------
 
     def step(self, frame: Frame) -> dict[int, Tracked]:
-        """Return the answers of the people in the result who are tracked, by number.
+        """Return the answers of the people in the result, by number.
 
-        Before that person is tracked, a result of one person has the status absent, or lost if the first person in the
-        volume could not be tracked.
+        Before anybody is tracked, person 0 is absent, or lost if the first person in the volume could not be tracked.
         """
         if not self._tracked and not self._awaited:
             return self._nobody(frame, lost=self._refused > 0)
@@ -345,8 +338,7 @@ class People:
         answers |= self._look(frame, owners)
         for member in self._tracked:
             if member.absent:
-                answer = answers[member.number]
-                answers[member.number] = replace(answer, estimate=replace(answer.estimate, origin=Status.ABSENT))
+                answers[member.number] = self._absent(answers[member.number])
         return {m.number: answers[m.number] for m in self.members} or self._nobody(frame)
 
     def _step_all(self, frame: Frame) -> tuple[dict[int, Tracked], PixelOwners]:
@@ -483,7 +475,12 @@ class People:
         """Return the answers in a frame before anybody in the result is tracked; ``lost``: somebody is there."""
         absent = self._no_pose
         lost_one = replace(absent, origin=Status.TRACKED, found=Reason.UNEXPLAINED)
-        return {} if self.several else {0: Tracked(lost_one if lost else absent, frame, frame)}
+        return {0: Tracked(lost_one if lost else absent, frame, frame)}
+
+    def _absent(self, answer: Tracked) -> Tracked:
+        """Return the answer for somebody who is absent: what is known of the cameras stays."""
+        kept = {name: getattr(answer.estimate, name) for name in ("cameras", "shift", "timing", "iterations")}
+        return replace(answer, estimate=replace(self._no_pose, **kept))
 
     @cached_property
     def _no_pose(self) -> Estimate:
