@@ -41,8 +41,8 @@ def pieces(path: str, masks: str) -> None:
 
     done("imports")
     from tk.kernels.runtime import ensure_runtime, ti
-    from tk.model.people import PeopleFinder
-    from tk.run.people import People
+    from tk.people.find import PeopleFinder
+    from tk.people.people import People
     from tk.run.plan import open_plan, recording_task
     from tk.run.task import RecordingOptions
     from tk.threads import one_thread

@@ -14,7 +14,7 @@ from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume
-from tk.model.people import LocatedPerson, PeopleFinder, order_people
+from tk.people.find import LocatedPerson, PeopleFinder, order_people
 
 RIG = ring_of_cameras(5, 240, 240)
 VOLUME = Volume((0.0, 0.0, 1.0), (2.4, 2.4, 2.2))

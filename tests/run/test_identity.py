@@ -16,7 +16,7 @@ from tk.kernels.line_search import COLOR_BINS
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.model.cues.part_colors import LearnedColors, PartColors
-from tk.run.identity import (
+from tk.people.identity import (
     EXCHANGED,
     KEPT,
     UNCLEAR,

@@ -27,8 +27,8 @@ from tk.io.results.status import Status
 from tk.model.body.angles import UNSEEN
 from tk.model.cameras.volume import Volume
 from tk.model.setup import Setup, Subject
+from tk.people.person import Person
 from tk.run import offline
-from tk.run.member import Member
 from tk.run.session import estimates, track_task
 from tk.run.task import Choice, Task, TrackOptions
 from tk.trackers.protocol import Frame
@@ -244,7 +244,7 @@ def test_a_run_stopped_among_the_frames_and_among_the_second_passes_is_finished(
             if frame == 2:
                 raise KeyboardInterrupt
 
-    def stop_at_person_1(finisher: Any, member: Member, *rest: Any) -> Any:
+    def stop_at_person_1(finisher: Any, member: Person, *rest: Any) -> Any:
         if member.number == 1:
             raise KeyboardInterrupt
         return finish_one(finisher, member, *rest)

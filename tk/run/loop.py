@@ -20,9 +20,9 @@ from tk.io.results.data import HullPoints, Value
 from tk.io.results.reader import as_damage_error, read_result
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
-from tk.run.member import Tracked
+from tk.people.people import People, PeopleState
+from tk.people.person import Tracked
 from tk.run.offline import REFINED
-from tk.run.people import People, PeopleState
 from tk.run.plan import Plan
 from tk.run.prefetch import Observed
 from tk.threads import one_thread
@@ -93,7 +93,8 @@ class Loop:
         self.plan, self.output, self.masks, self._note = plan, output, masks, note
         self.tracked = 0
         self._held: list[tuple[Row, dict[int, Row]]] = []  # of frames that are not in the file yet
-        self.people = People(plan.task, plan.tracker, note)
+        task = plan.task
+        self.people = People(task.setup, task.settings, task.options.people, plan.tracker, note)
 
     def frames(self) -> Iterator[tuple[Estimate, ...]]:
         """Start or restore the trackers, step them to the end and yield the estimates of all people in each frame; they

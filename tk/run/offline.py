@@ -18,10 +18,10 @@ from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.bundle import TrackedPoses
 from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
+from tk.people.identity import COLUMNS, doubtful, exchanged, exchanged_masks, report
+from tk.people.people import People
+from tk.people.person import Person
 from tk.run.delays import retimed, retimed_landmarks
-from tk.run.identity import COLUMNS, doubtful, exchanged, exchanged_masks, report
-from tk.run.member import Member
-from tk.run.people import People
 from tk.run.prefetch import open_observations
 from tk.run.refinement import compare_cameras, refine_if_inconsistent
 from tk.run.second_run import Run, Used, explains_better, track_again
@@ -118,7 +118,7 @@ class _Draft:
     columns: dict[str, NDArray[Any]] = field(default_factory=dict)
 
     def current(self, dataset: str) -> Any:
-        """Return one of :data:`~tk.run.identity.COLUMNS` as it is now; None if the result has none."""
+        """Return one of :data:`~tk.people.identity.COLUMNS` as it is now; None if the result has none."""
         return self.columns.get(dataset, getattr(self.result, COLUMNS[dataset]))
 
     def replace(self, rows: NDArray[np.int64], estimates: Sequence[Estimate]) -> None:
@@ -148,7 +148,7 @@ class _Finisher:
     within: Callable[[float], None]
     cameras: UsedCameras
 
-    def finish(self, member: Member, draft: _Draft, masks: MaskStore | None) -> Revision:
+    def finish(self, member: Person, draft: _Draft, masks: MaskStore | None) -> Revision:
         """Return what needs all frames of a person: the second pass; segments, feet and angles; the smoothed copy."""
         tracker, setup = member.tracker, self.task.setup
         model: Mapping[str, Value] | None = None
@@ -186,7 +186,7 @@ class _Finisher:
                     masks.put(observation.index, tracker.cleaned(tracker.without_foreign(observation).masks))
         return True
 
-    def _second_pass(self, member: Member, tracker: TwoPassTracker, masks: MaskStore, draft: _Draft) -> TwoPassTracker:
+    def _second_pass(self, member: Person, tracker: TwoPassTracker, masks: MaskStore, draft: _Draft) -> TwoPassTracker:
         """Optimise the poses of a draft by what all frames show. Return the tracker with the final cameras and body.
 
         The body is fitted to frames of the whole recording unless that began with the initialisation pose.
@@ -282,7 +282,7 @@ class _Finisher:
         return drafts
 
     def _with_final_cameras(
-        self, member: Member, tracker: TwoPassTracker, masks: MaskStore, draft: _Draft
+        self, member: Person, tracker: TwoPassTracker, masks: MaskStore, draft: _Draft
     ) -> tuple[TwoPassTracker, MaskStore]:
         """Return the tracker with refined cameras, and synchronised masks, if the cameras disagree about person 0 and
         ``settings.refine`` is True, else both as they are. Other people take over what person 0 has decided.
@@ -335,7 +335,7 @@ class _Finisher:
         return retimed_landmarks(self.task.setup.rig.reduced_pixels(found), draft.result.frames, late)
 
     def _track_again(
-        self, member: Member, draft: _Draft, before: Used, now: Used, late: NDArray[np.int64]
+        self, member: Person, draft: _Draft, before: Used, now: Used, late: NDArray[np.int64]
     ) -> list[str] | None:
         """Track a person again with refined cameras and without delays, (C,) frames, if there are delays or a camera
         was left out of many frames. Return lines for the user; None if the first pass, which then stays, explains the

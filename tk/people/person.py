@@ -12,10 +12,10 @@ from tk.kernels.mask_values import PERSON
 from tk.model.cameras.camera import Rig
 from tk.model.setup import Subject
 from tk.model.stateful import Stateful
+from tk.people.share import UNKNOWN
 from tk.trackers.camera_monitor import CameraMonitor, MonitorState
 from tk.trackers.protocol import Estimate, Frame, SharingTracker, Tracker, sharing, without_cameras
 from tk.trackers.registry import TrackerState
-from tk.trackers.sharing import UNKNOWN
 
 Float = NDArray[np.float64]
 
@@ -35,8 +35,8 @@ class Tracked:
 
 
 @dataclass(frozen=True)
-class MemberState:
-    """What changes from frame to frame, see :class:`Member`."""
+class PersonMotion:
+    """What changes from frame to frame, see :class:`Person`."""
 
     tracker: TrackerState
     monitor: MonitorState
@@ -47,10 +47,10 @@ class MemberState:
 
 
 @dataclass
-class Member(Stateful[MemberState]):
+class Person(Stateful[PersonMotion]):
     """A person who is tracked."""
 
-    State = MemberState
+    State = PersonMotion
 
     number: int  # in the result; people who are not written have higher numbers
     subject: Subject  # what is known of the person
