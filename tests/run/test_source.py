@@ -27,8 +27,8 @@ from tk.io.results.status import Status
 from tk.model.body.angles import UNSEEN
 from tk.model.cameras.volume import Volume
 from tk.model.setup import Setup, Subject
-from tk.people.person import Person
 from tk.run import offline
+from tk.run.draft import Draft
 from tk.run.session import estimates, track_task
 from tk.run.task import Choice, Task, TrackOptions
 from tk.trackers.protocol import Frame
@@ -244,10 +244,10 @@ def test_a_run_stopped_among_the_frames_and_among_the_second_passes_is_finished(
             if frame == 2:
                 raise KeyboardInterrupt
 
-    def stop_at_person_1(finisher: Any, member: Person, *rest: Any) -> Any:
-        if member.number == 1:
+    def stop_at_person_1(finisher: Any, draft: Draft) -> Any:
+        if draft.member.number == 1:
             raise KeyboardInterrupt
-        return finish_one(finisher, member, *rest)
+        return finish_one(finisher, draft)
 
     def track(reporter: Silent, resume: bool = True) -> tuple[Result, ...]:
         run = task(PAIR, Rendered(MASKS.max(axis=0)), frames=(0, COUNT), people="all")
@@ -255,10 +255,10 @@ def test_a_run_stopped_among_the_frames_and_among_the_second_passes_is_finished(
         return read_result(tmp_path / "r.h5").people
 
     run_clock(monkeypatch, EVERY_FRAME)
-    finish_one = offline._Finisher.finish
+    finish_one = offline._Finisher.revision
     assert len(track(Stop(), resume=False)[0].frames) < COUNT
     with monkeypatch.context() as patch:
-        patch.setattr(offline._Finisher, "finish", stop_at_person_1)
+        patch.setattr(offline._Finisher, "revision", stop_at_person_1)
         stopped = track(Silent())
     assert stopped[0].smoothed is None and stopped[1].smoothed is None, "the file is rewritten once, at the end"
     for a, b in zip(track(Silent()), pair, strict=True):
