@@ -23,9 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ConfigError
-from tk.io.results.status import Status
 from tk.kernels.mask_values import OTHERS, PERSON
-from tk.model.body.skeleton import JOINTS
 from tk.model.cues.part_colors import RenderedBody
 from tk.model.cues.ray_costs import RayGrid
 from tk.model.masks.image_health import contradiction, sampled
@@ -34,12 +32,11 @@ from tk.people.choose import chosen, in_order, matched, unknown
 from tk.people.find import LocatedPerson, PeopleFinder
 from tk.people.hulls import shares_by_hulls
 from tk.people.identity import EXCHANGED, UNCLEAR, Contact, Contacts, judge
-from tk.people.person import Person, PersonMotion, Tracked
+from tk.people.person import Person, PersonState, Tracked, without_pose
 from tk.people.share import PixelOwners, assign
 from tk.settings import Settings
 from tk.trackers.camera_monitor import CameraMonitor, spread_over
-from tk.trackers.protocol import Estimate, Frame, Tracker, sharing
-from tk.trackers.reason import Reason
+from tk.trackers.protocol import Frame, Tracker, sharing
 
 _LOG = logging.getLogger(__name__)
 
@@ -57,25 +54,6 @@ _UNEXPLAINED = 0.25
 # Likeness by the colours above which somebody who enters is a person who has left. On pair and a rendered crossing, by
 # colours and body: -0.1 to -0.7 for the same person, -1.6 to -3.7 for the other one.
 _SAME_COLORS = -1.1
-
-
-@dataclass(frozen=True)
-class PersonState:
-    """A person who is tracked.
-
-    Attributes:
-        number: see :class:`~tk.people.person.Person`.
-        subject: number of the subject; None: nothing is known of the person.
-        in_init_pose: whether the subject began in the initialisation pose.
-        body: of a person who is not in the result; None of others.
-        member: what changes from frame to frame.
-    """
-
-    number: int
-    subject: int | None
-    in_init_pose: bool
-    body: dict[str, Any] | None
-    member: PersonMotion
 
 
 @dataclass(frozen=True)
@@ -121,11 +99,9 @@ class People:
         share = sharing(first)
         self._grid: RayGrid | None = None if share is None else share.choice
 
-    def _make(self) -> Tracker:
-        """Return another tracker of the same method."""
-        return type(self._first).of(self._setup, self._settings)
-
-    def _person(self, number: int, subject: Subject, tracker: Tracker, written: bool = True) -> Person:
+    def _person(self, number: int, subject: Subject, written: bool = True) -> Person:
+        """Return somebody with the first tracker, whose kernels are compiled, or with another, if somebody has it."""
+        tracker = type(self._first).of(self._setup, self._settings) if self._tracked else self._first
         return Person(number, subject, tracker, CameraMonitor(tracker, self._setup, subject), written)
 
     @property
@@ -239,9 +215,9 @@ class People:
         rest = [n for n, person in enumerate(found) if n not in numbers and person.views.sum() >= 2]
         shares = shares or self._shares([*people, *(found[n] for n in rest)], opening)
         for k, frames in enumerate(shares[: len(numbers)]):
-            member = self._person(len(self._tracked), known[k], self._new_tracker())
+            member = self._person(len(self._tracked), known[k])
             try:
-                self._begin(member, frames, people[k].height_m if people else None, opening)
+                member.begin(frames, people[k].height_m if people else None, opening)
             except CaptureError as error:
                 if self._choice != "all" or not (self._tracked or people[k + 1 :]):
                     raise
@@ -252,25 +228,6 @@ class People:
         for n, frames in zip(rest, shares[len(people) :], strict=False):
             if found[n].inside and self._admit(frames, found[n], unknown(subjects[0]), written=False):
                 self._given.add(n)
-
-    def _new_tracker(self) -> Tracker:
-        """Return a tracker that nobody has: the first, whose kernels are compiled, or another."""
-        return self._make() if self._tracked else self._first
-
-    def _begin(
-        self, member: Person, frames: Sequence[Frame], hull_m: float | None, whole: Sequence[Frame] = ()
-    ) -> None:
-        """Start a tracker.
-
-        Args:
-            member: the person.
-            frames: the person's share of the opening.
-            hull_m: height of the visual hull in the first frame.
-            whole: the opening with everybody's masks.
-        """
-        seen = member.monitor.start(frames, whole)
-        member.tracker.start(seen, replace(member.subject, hull_m=hull_m))
-        member.monitor.check_body()
 
     @cached_property
     def _finder(self) -> PeopleFinder:
@@ -316,7 +273,7 @@ class People:
         answers |= self._look(frame, owners)
         for member in self._tracked:
             if member.absent:
-                answers[member.number] = self._absent(answers[member.number])
+                answers[member.number] = answers[member.number].absent(member.tracker)
         return {m.number: answers[m.number] for m in self.members} or self._nobody(frame)
 
     def _owners(self, frame: Frame, ahead: bool = False) -> PixelOwners:
@@ -399,9 +356,9 @@ class People:
         # people who are not written have higher numbers than all who are, now and later
         higher = len(self._choice) if isinstance(self._choice, tuple) else 1
         number = len(self.members) if written else max([higher, *(1 + m.number for m in self._tracked)])
-        member = self._person(number, subject, self._new_tracker(), written)
+        member = self._person(number, subject, written)
         try:
-            self._begin(member, frames, person.height_m)
+            member.begin(frames, person.height_m)
         except CaptureError as reason:
             self._refuse(frames[0].index, reason)
             return None
@@ -418,28 +375,7 @@ class People:
 
     def _nobody(self, frame: Frame, lost: bool = False) -> dict[int, Tracked]:
         """Return the answers in a frame before anybody in the result is tracked; ``lost``: somebody is there."""
-        absent = self._no_pose
-        lost_one = replace(absent, origin=Status.TRACKED, found=Reason.UNEXPLAINED)
-        return {0: Tracked(lost_one if lost else absent, frame, frame)}
-
-    def _absent(self, answer: Tracked) -> Tracked:
-        """Return the answer for somebody who is absent: what is known of the cameras stays."""
-        kept = {name: getattr(answer.estimate, name) for name in ("cameras", "shift", "timing", "iterations")}
-        return replace(answer, estimate=replace(self._no_pose, **kept))
-
-    @cached_property
-    def _no_pose(self) -> Estimate:
-        tracker, views = self._first, len(self._setup.rig)
-        return Estimate(
-            pose=np.full(len(tracker.pose_names), np.nan),
-            joints=np.full((len(JOINTS), 3), np.nan),
-            origin=Status.ABSENT,
-            objective=np.nan,
-            iterations=np.zeros(len(tracker.stages), np.int32),
-            timing=dict.fromkeys(tracker.timing_stages, 0.0),
-            deviation=np.full(len(JOINTS), np.nan) if tracker.reports_sigma else None,
-            residual=np.full((views, 2), np.nan) if tracker.reports_sigma else None,
-        )
+        return {0: Tracked(without_pose(self._first, len(self._setup.rig), lost), frame, frame)}
 
     # --- what a result keeps ------------------------------------------------------------------------------------------
 
@@ -483,7 +419,7 @@ class People:
             if k is not None and subjects[k].in_init_pose and not person.in_init_pose:
                 self._begin_in_any_pose(k)
             known = Subject(in_init_pose=person.in_init_pose) if k is None else self._setup.subjects[k]
-            member = self._person(person.number, known, self._new_tracker(), written=person.body is None)
+            member = self._person(person.number, known, written=person.body is None)
             member.tracker.take_model(models[person.number] if person.body is None else person.body)
             member.state = person.member
             self._tracked.append(member)

@@ -275,7 +275,8 @@ def test_chosen_frames_cover_all_positions_of_a_person_who_stands_still_for_long
 def test_cameras_are_refined_from_all_people():
     """The equations of the cameras are the sum of those of each person, and their prior counts once."""
     seen = frames(in_time(), PERTURBED)
-    people, sigmas = [(BODY, seen[:4]), (build_cone_body(BodyDimensions.from_stature(1.6)), seen[4:])], {"turn": 0.01, "move": 0.01}
+    people = [(BODY, seen[:4]), (build_cone_body(BodyDimensions.from_stature(1.6)), seen[4:])]
+    sigmas = {"turn": 0.01, "move": 0.01}
     both, *alone = (
         PeopleBundle(some, 0.03, PERTURBED, CAMERA_SEARCH, sigmas) for some in (people, people[:1], people[1:])
     )
