@@ -81,7 +81,7 @@ def pieces(path: str, masks: str) -> None:
         with one_thread():
             PeopleFinder(setup.rig, setup.volume, setup.up).find(opening[0].masks, opening[0].uncertain)
             done("finding people")
-            people = People(task, plan.tracker, lambda _: None)
+            people = People(setup, task.settings, task.options.people, plan.tracker, lambda _: None)
             find, fit = contour_finder.find_person, contour_finder.fit_body
             with (
                 mock.patch.object(contour_finder, "find_person", timed("search for the pose", find)),

@@ -39,8 +39,9 @@ class Tracked:
     used: Frame
 
     def absent(self, tracker: Tracker) -> Tracked:
-        """Return the answer of somebody who is absent: what is known of the cameras stays."""
-        kept = {name: getattr(self.estimate, name) for name in ("cameras", "shift", "timing", "iterations")}
+        """Return the answer of somebody who is absent: the reason, and what is known of the cameras, stay."""
+        names = ("found", "judged", "cameras", "shift", "timing", "iterations")
+        kept = {name: getattr(self.estimate, name) for name in names}
         return replace(self, estimate=replace(without_pose(tracker, len(self.share.masks)), **kept))
 
 
