@@ -41,8 +41,8 @@ def pieces(path: str, masks: str) -> None:
 
     done("imports")
     from tk.kernels.runtime import ensure_runtime, ti
-    from tk.model.people import PeopleFinder
-    from tk.run.people import People
+    from tk.people.find import PeopleFinder
+    from tk.people.people import People
     from tk.run.plan import open_plan, recording_task
     from tk.run.task import RecordingOptions
     from tk.threads import one_thread
@@ -81,7 +81,7 @@ def pieces(path: str, masks: str) -> None:
         with one_thread():
             PeopleFinder(setup.rig, setup.volume, setup.up).find(opening[0].masks, opening[0].uncertain)
             done("finding people")
-            people = People(task, plan.tracker, lambda _: None)
+            people = People(setup, task.settings, task.options.people, plan.tracker, lambda _: None)
             find, fit = contour_finder.find_person, contour_finder.fit_body
             with (
                 mock.patch.object(contour_finder, "find_person", timed("search for the pose", find)),

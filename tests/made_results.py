@@ -12,6 +12,9 @@ from tk.io.results.data import ResultMeta, Value
 from tk.io.results.writer import ResultWriter
 from tk.model.body.skeleton import Skeleton
 
+#: groups of the run, not of a person
+RUN = ("frames", "time", "timing")
+
 
 def write_motion(
     path: Path,
@@ -45,6 +48,7 @@ def write_motion(
                 "frames": f, "pose": pose, "joints/position": skeleton.joints(pose), "status": 0, "objective": 0.1,
                 "iterations": [9], **row(f),
             }  # fmt: skip
-            values = {"time": values["frames"] / whole.fps, **values}
-            writer.append({person: values for person in people if person == 0 or f in second})
+            frame = {name: values.pop(name) for name in list(values) if name.split("/")[0] in RUN}
+            frame = {"time": frame["frames"] / whole.fps, **frame}
+            writer.append(frame, {person: values for person in people if person == 0 or f in second})
     return path

@@ -74,7 +74,7 @@ def test_frames_without_anybody_are_counted_apart(tk: Tk, quick: Path, copy: Pat
     assert ran.code == 0, ran.err
     found = json.loads(ran.out)
     assert (found["lost"], found["absent"]) == (0, FRAMES - 4)
-    assert f"0 lost, {FRAMES - 4} with nobody in view" in ran.messages[-1]
+    assert f"0 lost, {FRAMES - 4} absent" in ran.messages[-1]
 
 
 def test_quiet_json_prints_nothing_but_json(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:

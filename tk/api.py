@@ -117,7 +117,7 @@ def track(
         init_pose: a file with a rough initial pose, or a folder of 2D keypoints; only with a capture.
         body: a result or a TOML file whose body is taken; only with a capture.
         people: "auto" (one person: the nearest to the initial pose if one is given, else the first that
-            :func:`tk.model.people.order_people` returns), "all", or numbers in that order, then in that of entering.
+            :func:`tk.people.find.order_people` returns), "all", or numbers in that order, then in that of entering.
         segmenter: makes the masks, unless the capture has some, instead of the empty scene or an installed segmenter.
         causal: stop after the first pass. Without ``output`` there is no second one.
         resume: continue an earlier run with the same ``output``.

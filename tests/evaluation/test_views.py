@@ -77,7 +77,7 @@ def test_results_of_both_body_models_are_evaluated(tk: Tk, tiny: Path, tracked: 
 def test_body_of_a_result_without_parts_follows_from_its_dimensions(tiny: Path, tracked: Path, tmp_path: Path) -> None:
     older = Path(shutil.copy(tracked, tmp_path / "older.h5"))
     with h5py.File(older, "a") as file:
-        del file["model/parts"]
+        del file["people/0/model/parts"]
     restored = body_and_poses(read_result(older))
     assert restored is not None
     body, poses = restored
@@ -88,8 +88,8 @@ def test_body_of_a_result_without_parts_follows_from_its_dimensions(tiny: Path, 
 def test_results_without_a_body_have_pixels_only(tiny: Path, tracked: Path, tmp_path: Path) -> None:
     bare = Path(shutil.copy(tracked, tmp_path / "bare.h5"))
     with h5py.File(bare, "a") as file:
-        del file["model"]
-        file.create_group("model")
+        del file["people/0/model"]
+        file.create_group("people/0/model")
     found = evaluate_views(bare, tiny / "truth.h5", tiny)
     assert found.silhouette_error is None and str(bare) in found.note and found.joint_px > 0
 
@@ -124,11 +124,11 @@ def without_columns(path: Path, names: tuple[str, ...]) -> Path:
     with h5py.File(path, "a") as file:
         kept = [k for k, name in enumerate(file["pose"].attrs["names"]) if name not in names]
         values, attributes = file["pose"][:, kept], dict(file["pose"].attrs)
-        del file["pose"]
-        file["pose"] = values
+        del file["people/0/pose"]
+        file["people/0/pose"] = values
         for key, value in attributes.items():
             file["pose"].attrs[key] = value[kept]
-        del file["smoothed"]
+        del file["people/0/smoothed"]
     return path
 
 

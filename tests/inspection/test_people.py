@@ -19,7 +19,7 @@ from tk.io.captures.capture import open_capture
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
-from tk.model.people import LocatedPerson, PeopleFinder
+from tk.people.find import LocatedPerson, PeopleFinder
 
 FRAMES = 24
 RIG = ring_of_cameras(4, 160, 120)

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.io.result_victim import META, make_frame, make_state
+from tests.io.result_victim import META, make_frame, make_run, make_state
 from tk.io.results.data import ResultMeta, UsedCameras, Value
 from tk.io.results.reader import read_result
 from tk.io.results.schema import checked_row, columns_of
@@ -23,7 +23,7 @@ from tk.model.cameras.camera import Camera, Rig
 def append(writer: ResultWriter, *indices: int, state: bool = True, flush: bool = True) -> None:
     """Append frames of one person."""
     for index in indices:
-        writer.append({0: make_frame(index)}, make_state(index) if state else None, flush)
+        writer.append(make_run(index), {0: make_frame(index)}, make_state(index) if state else None, flush)
 
 
 def write(path: Path, count: int, meta: ResultMeta = META) -> None:
@@ -45,7 +45,7 @@ def assert_complete(path: Path, at_least: int) -> int:
     with h5py.File(path, "r") as file:  # as any user would open it
         count = len(file["frames"])
         assert count >= at_least
-        rows = [checked_row(make_frame(index), columns) for index in range(count)]
+        rows = [checked_row(make_run(index) | make_frame(index), columns) for index in range(count)]
         for name, column in columns.items():
             np.testing.assert_array_equal(file[name][()], np.reshape([row[name] for row in rows], (-1, *column.shape)))
         if count > 1:

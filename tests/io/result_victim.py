@@ -45,18 +45,19 @@ META = ResultMeta(
 )
 
 
+def make_run(index: int) -> dict[str, Any]:
+    """Return the values of the run in frame ``index`` by path."""
+    return {"frames": index + 3, "time": index / 15, "timing/hull": 0.01, "timing/total": 0.05 + index}
+
+
 def make_frame(index: int) -> dict[str, Any]:
-    """Return the values of frame ``index`` by path; some frames have no voxels, no sigma or no landmarks."""
+    """Return a person's values in frame ``index`` by path; some frames have no voxels, no sigma or no landmarks."""
     frame: dict[str, Any] = {
-        "frames": index + 3,
-        "time": index / 15,
         "pose": np.arange(24) + 100.0 * index,
         "joints/position": np.arange(45.0).reshape(15, 3) + index,
         "status": Status.INITIALISED if index == 0 else Status.TRACKED,
         "objective": index / 2,
         "iterations": np.array([index, index + 1]),
-        "timing/hull": 0.01,
-        "timing/total": 0.05 + index,
         "residual": np.array([[0.1, 0.0], [0.1, 0.1], [0.0, index]]),
         "mask_source": np.array([0, 1, index % 2], np.uint8),
         "segments/rotation": np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)),
@@ -86,7 +87,7 @@ def main() -> None:
         if done == 0:
             writer.write_model({"torso/radii_m": np.array([0.1, 0.2]), "sex": "any"})
         for index in range(done, int(sys.argv[2])):
-            writer.append({0: make_frame(index)}, make_state(index))
+            writer.append(make_run(index), {0: make_frame(index)}, make_state(index))
             print(index + 1, flush=True)
 
 

@@ -299,10 +299,11 @@ def test_pipes_devices_and_dangling_links_are_refused(tmp_path: Path) -> None:
 
 def test_reader_lists_datasets_and_groups(result: Path) -> None:
     with open_hdf5(result) as file:
-        assert file.shapes["joints/position"] == (COUNT, 15, 3)
-        assert "model" in file and "model/height_m" in file and "nothing" not in file
-        assert file.below("model") == ["count", "height_m", "sex", "torso/radii_m"]
+        assert file.shapes["people/0/joints/position"] == (COUNT, 15, 3)
+        assert "people/0/model" in file and "people/0/model/height_m" in file and "nothing" not in file
+        assert "model" not in file, "a link"
+        assert file.below("people/0/model") == ["count", "height_m", "sex", "torso/radii_m"]
         with pytest.raises(ResultError, match=r"/pose has shape 6×24; any×3 is expected"):
-            file.array("pose", "float64", (None, 3))
+            file.array("people/0/pose", "float64", (None, 3))
         with pytest.raises(ResultError, match="out of range"):
-            file.array("pose", "float64", (COUNT, 24), high=1.0)
+            file.array("people/0/pose", "float64", (COUNT, 24), high=1.0)

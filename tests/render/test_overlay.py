@@ -104,8 +104,8 @@ def test_results_of_the_region_tracker_are_drawn(tiny: Path, causal: Path, tmp_p
     (sheet,) = write_sheets(Overlay(capture, read_result(path)), tmp_path, [1], full=True)
     picture = cv2.imread(str(sheet))
     with h5py.File(path, "a") as file:
-        del file["model"]
-        file.create_group("model")
+        del file["people/0/model"]
+        file.create_group("people/0/model")
     (bare,) = write_sheets(Overlay(capture, read_result(path)), tmp_path / "bare", [1], full=True)
     differ = (picture != cv2.imread(str(bare))).any(axis=2)
     assert 0.01 < differ.mean() < 0.5, "the body is drawn, and not everywhere"
@@ -234,7 +234,7 @@ def test_legend_names_the_colours_that_are_seen(result: Path) -> None:
     strips = []
     for shown in (one, two, replace(one, model={}), with_sigma):
         strips.append(np.zeros((LEGEND_HEIGHT, 960, 3), np.uint8))
-        Legend(People(shown.aligned()), 960).draw(strips[-1], 0)
+        Legend(People(shown.people), 960).draw(strips[-1], 0)
     limbs = [SEGMENT_COLORS[name] for name in ("upper_arm_l", "thigh_l", "upper_arm_r", "thigh_r", "torso")]
     assert [[shows(strip, color) for color in limbs] for strip in strips] == [[True] * 5] * 2 + [[False] * 5] + [
         [True] * 5
@@ -243,7 +243,7 @@ def test_legend_names_the_colours_that_are_seen(result: Path) -> None:
     ramp = sigma_colors([0.0])[0]
     assert [bool((strip == ramp).all(axis=2).any()) for strip in strips] == [False] * 3 + [True]
     narrow = np.zeros((LEGEND_HEIGHT, 320, 3), np.uint8)
-    Legend(People(two.aligned()), 320).draw(narrow, 0)
+    Legend(People(two.people), 320).draw(narrow, 0)
     assert not shows(narrow, limbs[0]), "no room"
 
 
@@ -266,7 +266,7 @@ def test_camera_that_was_left_out_is_dark_and_named(result: Path) -> None:
             assert np.median(marked[20:]) < 0.5 * np.median(usual[20:])
             name = marked[:20].astype(int)
             assert (name[..., 2] - name[..., 0] > 60).any(), "its name is red"
-    assert People(replace(one, meta=meta, residual=residual).aligned()).left_out.sum() == 1
+    assert People(replace(one, meta=meta, residual=residual).people).left_out.sum() == 1
 
 
 def test_videos_show_where_the_person_moves(result: Path) -> None:

@@ -67,12 +67,13 @@ def complete_result(path: Path, capture_path: Path, count: int = FRAMES) -> Path
 
 def with_partner(result: Result) -> Result:
     """Return a result with a second person half a metre aside, who enters in frame 4 and is lost in frame 5."""
-    second = result.at_rows(np.arange(4, len(result)))
+    second = result.at_rows(np.where(np.arange(len(result)) < 4, -1, np.arange(len(result))))
+    second = replace(second, frames=result.frames, time=result.time, timing=result.timing)
     aside = np.array([0.5, 0, 0])
     second.pose[:, :3] += aside
     second.joints[...] += aside
-    second.status[:] = Status.TRACKED
-    second.status[1] = Status.LOST
+    second.status[4:] = Status.TRACKED
+    second.status[5] = Status.LOST
     return replace(result, others=(replace(second, person=1),))
 
 

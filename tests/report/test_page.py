@@ -349,7 +349,7 @@ def test_headline_counts_the_cameras_used(
 
 def test_people_with_different_frames_are_aligned(complete: Path) -> None:
     result = read_result(complete)
-    first, second = with_partner(result).aligned()
+    first, second = with_partner(result).people
     np.testing.assert_array_equal(first.joints, result.joints)
     assert second.frames.tolist() == result.frames.tolist() and (second.status[:4] == Status.ABSENT).all()
     assert np.isnan(second.joints[:4]).all() and np.isfinite(second.joints[4:]).all()

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tk.model.people import LocatedPerson
 from tk.model.setup import Subject
-from tk.run.choice import matched
+from tk.people.choose import matched
+from tk.people.find import LocatedPerson
 
 
 def person(position: tuple[float, float, float], height_m: float) -> LocatedPerson:

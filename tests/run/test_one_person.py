@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.model.test_people import FINDER, RIG, VOLUME, drawn
-from tk.model.people import LocatedPerson
 from tk.model.setup import Setup, Subject
-from tk.run.one_person import really_there
+from tk.people.choose import really_there
+from tk.people.find import LocatedPerson
 from tk.trackers.protocol import Frame
 
 SETUP = Setup(RIG, VOLUME, "z", 15.0, (Subject(None, 0),))

@@ -14,7 +14,7 @@ from tk.io.captures.capture import open_capture
 from tk.model.body.anthropometry import AVERAGE_BODY
 from tk.model.body.cone_body import build_cone_body
 from tk.model.setup import Subject
-from tk.run.people import People
+from tk.people.people import People
 from tk.run.task import Task, TrackOptions
 from tk.trackers.protocol import Frame
 from tk.trackers.region import RegionTracker
@@ -24,7 +24,7 @@ from tk.trackers.region import RegionTracker
 def test_an_opening_ends_where_two_people_are_mixed_up(tmp_path: Path, meet: bool) -> None:
     capture = open_capture(write_people(tmp_path / "two", [lambda _: (-0.6, 0.0), lambda _: (0.6, 0.1)], 1))
     task = Task(capture.setup(), capture, TrackOptions(people="all"))
-    people = People(task, RegionTracker.of(task.setup, task.settings), lambda _: None)
+    people = People(task.setup, task.settings, "all", RegionTracker.of(task.setup, task.settings), lambda _: None)
     opening = []
     for k in range(16):
         at = min(0.08 * k, 0.55) - 0.6 if meet else -0.6
@@ -52,7 +52,7 @@ def test_somebody_who_cannot_be_tracked_does_not_end_the_run_of_others(tmp_path:
     capture = open_capture(write_people(tmp_path / "two", [lambda _: (-0.6, 0.0), lambda _: (0.6, 0.1)], 1))
     told: list[str] = []
     task = Task(capture.setup(), capture, TrackOptions(people="all"))
-    people = People(task, Finds.of(task.setup, task.settings), told.append)
+    people = People(task.setup, task.settings, "all", Finds.of(task.setup, task.settings), told.append)
     masks = np.stack([person_mask(camera, (-0.6, 0.0)) | person_mask(camera, (0.6, 0.1)) for camera in RIG])
     opening = [Frame(k, np.zeros((*masks.shape, 3), np.uint8), masks) for k in range(2)]
     if len(failing) == 2:

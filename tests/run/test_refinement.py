@@ -34,7 +34,8 @@ from tk.model.cameras.bundle import TrackedPoses
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.refinement import turn_between
 from tk.run import offline as finish
-from tk.run.delays import retimed, retimed_landmarks, whole_delays
+from tk.run.delays import TrackedPerson, retimed, retimed_landmarks, whole_delays
+from tk.run.draft import Draft
 from tk.run.refined_calibration import refine_capture
 from tk.run.refinement import BetterCameras
 from tk.settings import Settings
@@ -118,8 +119,9 @@ def test_reduced_images_refine_the_recorded_cameras(run: tuple[Path, Silent], tu
 def test_cameras_that_were_moved_are_not_compared(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[np.ndarray] = []
 
-    def compare(tracker: Any, store: MaskStore, tracked: TrackedPoses) -> None:
-        seen.append(np.array([store.get(frame).any(axis=(1, 2)) for frame in tracked.frames.tolist()]))
+    def compare(people: list[TrackedPerson], *_: Any) -> None:
+        (person,) = people
+        seen.append(np.array([person.masks(frame).any(axis=(1, 2)) for frame in person.tracked.frames.tolist()]))
 
     monkeypatch.setattr(finish, "compare_cameras", compare)
     monkeypatch.setattr(CameraMonitor, "moved", np.array([False, True, False, False]))
@@ -131,8 +133,8 @@ def test_late_videos_are_tracked_again(tiny: Path, tmp_path: Path, monkeypatch: 
     """With invented delays: which frames are tracked again, and that every frame keeps its row."""
     asked: list[np.ndarray] = []
 
-    def made_up(tracker: Any, *_: Any) -> Any:
-        return BetterCameras(tracker, np.array([0.0, 0.0, 1.0, -1.0]), "refined")
+    def made_up(people: Any, rig: Rig, *_: Any) -> Any:
+        return BetterCameras(rig, np.array([0.0, 0.0, 1.0, -1.0]), "refined")
 
     read = Capture.frames
 
@@ -161,8 +163,8 @@ def test_delays_that_explain_the_images_worse_are_not_used(
 ) -> None:
     """The videos are synchronous; a delay of three frames is invented."""
 
-    def made_up(tracker: Any, *_: Any) -> Any:
-        return BetterCameras(tracker, np.array([0.0, 0.0, 3.0, 0.0]), "refined")
+    def made_up(people: Any, rig: Rig, *_: Any) -> Any:
+        return BetterCameras(rig, np.array([0.0, 0.0, 3.0, 0.0]), "refined")
 
     settings, path, reporter = settings_file.from_toml(QUICK), tmp_path / "again.h5", Silent()
     track(open_capture(tiny), tmp_path / "plain.h5", settings)
@@ -188,7 +190,7 @@ def test_result_without_a_body_and_bad_options_are_refused(tiny: Path, tracked: 
     bare = tmp_path / "bare.h5"
     shutil.copy(tracked, bare)
     with h5py.File(bare, "r+") as file:
-        del file["model"]
+        del file["people/0/model"]
     tk("calibrate", tiny, "--refine", bare, "-o", output).complaint(str(bare), "no body with contours")
     tk("calibrate", tiny, "--refine", tracked, "-o", output, "--trust", "0").complaint("trust = 0")
     assert not output.exists()
@@ -206,7 +208,7 @@ def test_videos_that_are_late_by_more_than_edges_reach_are_found(late: list[int]
     drawn[away] = 0
     seen = np.array([[drawn[min(max(k + n, 0), 23), c] for c, n in enumerate(late)] for k in frames])
     tracked = TrackedPoses(frames, poses, seen.any(axis=(2, 3)).all(axis=1))
-    found = whole_delays(body, rig, seen.__getitem__, tracked)
+    found = whole_delays([TrackedPerson(body, seen.__getitem__, tracked)], rig)
     assert found.tolist() == late
 
 
@@ -220,7 +222,7 @@ def test_delay_at_the_edge_of_the_range_is_searched_farther_and_never_taken(coun
     drawn = draw_silhouettes(body, rig, poses)
     seen = np.array([[drawn[min(k + n, count - 1), c] for c, n in enumerate((0, 12, 0, 0))] for k in frames])
     tracked = TrackedPoses(frames, poses, np.ones(count, np.bool_))
-    assert whole_delays(body, rig, seen.__getitem__, tracked).tolist() == found
+    assert whole_delays([TrackedPerson(body, seen.__getitem__, tracked)], rig).tolist() == found
 
 
 def test_an_excluded_camera_is_not_late() -> None:
@@ -233,7 +235,9 @@ def test_an_excluded_camera_is_not_late() -> None:
     aside = np.roll(seen[24:, 1], 50, axis=2)  # the camera is turned
     seen[24:, 1] = np.where(aside > 0, OTHERS, 0)
     seen[24:, 1, 50:54, 70:74] = 255
-    found = whole_delays(body, rig, seen.__getitem__, TrackedPoses(frames, poses, np.ones(40, np.bool_)))
+    found = whole_delays(
+        [TrackedPerson(body, seen.__getitem__, TrackedPoses(frames, poses, np.ones(40, np.bool_)))], rig
+    )
     assert found.tolist() == [0, 0, 0, 0]
 
 
@@ -277,10 +281,10 @@ def judged(
         "evidence/origin": np.array([Status.RECOVERED, *(F - 1) * [Status.TRACKED]], np.uint8),
     }
     result: Any = SimpleNamespace(frames=np.arange(F), **dict.fromkeys(finish.COLUMNS.values()))
-    draft = finish._Draft(result, np.zeros(F, np.bool_), np.zeros(F, np.bool_), columns)
-    cameras: Any = SimpleNamespace(rig=ring_of_cameras(4, 160, 120))
+    nobody: Any = None
+    draft = Draft(nobody, result, nobody, np.zeros(F, np.bool_), np.zeros(F, np.bool_), columns, refined=True)
     task: Any = SimpleNamespace(settings=Settings())
-    finish._Finisher(task, True, notes.append, lambda _: None, cameras)._judge(draft, True)
+    finish._Finisher(task, True, notes.append, lambda _: None, ring_of_cameras(4, 160, 120))._judge(draft)
     finish.report_frames(result.frames, draft.current("evidence/reason"), notes.append)
     return draft, notes
 
@@ -319,7 +323,7 @@ def test_person_who_is_tracked_again_by_other_trackers_is_judged_as_in_the_first
     result: Any = SimpleNamespace(**{**vars(draft.result), "status": np.zeros(6, np.uint8)})
     draft = replace(draft, result=result, columns=draft.columns | given)
     task: Any = SimpleNamespace(settings=Settings(), setup=SimpleNamespace(rig=rig, fps=15.0))
-    finisher = finish._Finisher(task, True, print, lambda _: None, SimpleNamespace(rig=rig))  # type: ignore[arg-type]
+    finisher = finish._Finisher(task, True, print, lambda _: None, rig)
     tracker: Any = Jumping()
     (found,) = finisher._tracked_by([tracker], draft, np.zeros((6, 4), np.bool_))
     assert found.lost.tolist() == [False, False, False, True, False, False]

@@ -28,7 +28,7 @@ from tk.model.body.angles import UNSEEN
 from tk.model.cameras.volume import Volume
 from tk.model.setup import Setup, Subject
 from tk.run import offline
-from tk.run.member import Member
+from tk.run.draft import Draft
 from tk.run.session import estimates, track_task
 from tk.run.task import Choice, Task, TrackOptions
 from tk.trackers.protocol import Frame
@@ -144,13 +144,12 @@ def test_frames_before_the_first_person_are_absent_and_the_others_as_if_tracking
     reporter, late = Silent(), tmp_path / "late.h5"
     summary = track_task(task(SETUP, LATE, people=people), late, reporter)
     result = read_result(late)
-    absent = 0 if people == "all" else EMPTY  # of several people, only frames with a person have rows
-    assert (result.status == Status.ABSENT).tolist() == absent * [True] + len(POSES) * [False]
+    assert (result.status == Status.ABSENT).tolist() == EMPTY * [True] + len(POSES) * [False]
     assert summary.present == len(POSES) and reporter.frames == list(range(EMPTY + len(POSES)))
     assert reporter.notes == [f"frame {EMPTY}: the first person has entered"]
     for name in ("pose", "joints", "sigma", "status"):
-        np.testing.assert_array_equal(getattr(result, name)[absent:], getattr(begun, name), err_msg=name)
-    assert np.isfinite(result.joints).all()
+        np.testing.assert_array_equal(getattr(result, name)[EMPTY:], getattr(begun, name), err_msg=name)
+    assert np.isfinite(result.joints).any(axis=(1, 2)).tolist() == EMPTY * [False] + len(POSES) * [True]
 
 
 @pytest.mark.parametrize("stop", [EMPTY - 2, EMPTY + 1])
@@ -245,10 +244,10 @@ def test_a_run_stopped_among_the_frames_and_among_the_second_passes_is_finished(
             if frame == 2:
                 raise KeyboardInterrupt
 
-    def stop_at_person_1(finisher: Any, member: Member, *rest: Any) -> Any:
-        if member.number == 1:
+    def stop_at_person_1(finisher: Any, draft: Draft) -> Any:
+        if draft.member.number == 1:
             raise KeyboardInterrupt
-        return finish_one(finisher, member, *rest)
+        return finish_one(finisher, draft)
 
     def track(reporter: Silent, resume: bool = True) -> tuple[Result, ...]:
         run = task(PAIR, Rendered(MASKS.max(axis=0)), frames=(0, COUNT), people="all")
@@ -256,10 +255,10 @@ def test_a_run_stopped_among_the_frames_and_among_the_second_passes_is_finished(
         return read_result(tmp_path / "r.h5").people
 
     run_clock(monkeypatch, EVERY_FRAME)
-    finish_one = offline._Finisher.finish
+    finish_one = offline._Finisher.revision
     assert len(track(Stop(), resume=False)[0].frames) < COUNT
     with monkeypatch.context() as patch:
-        patch.setattr(offline._Finisher, "finish", stop_at_person_1)
+        patch.setattr(offline._Finisher, "revision", stop_at_person_1)
         stopped = track(Silent())
     assert stopped[0].smoothed is None and stopped[1].smoothed is None, "the file is rewritten once, at the end"
     for a, b in zip(track(Silent()), pair, strict=True):
@@ -342,20 +341,22 @@ def second(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, tuple[Subj
 
 def test_somebody_who_enters_gets_a_number_and_who_leaves_is_absent(everybody: tuple[Result, ...]) -> None:
     first, second = everybody
-    np.testing.assert_array_equal(first.frames, np.arange(ENTERING))
-    assert not (first.status == Status.LOST).any()
-    np.testing.assert_array_equal(second.frames, np.arange(second.frames[0], 17))
-    assert 3 < second.frames[0] < 16 and not (second.status == Status.LOST).any()
+    assert not (first.status >= Status.LOST).any()
+    (here,) = np.nonzero(second.status != Status.ABSENT)
+    np.testing.assert_array_equal(here, np.arange(here[0], 17))
+    assert 3 < here[0] < 16 and not (second.status == Status.LOST).any()
     for own, result in zip(ENTER, (first, second), strict=True):
-        joints = np.array([BODY.skeleton.joints(pose) for pose in own[result.frames]])
-        assert np.median(np.linalg.norm(result.joints - joints, axis=2)) < 0.1  # coarse settings
+        np.testing.assert_array_equal(result.frames, np.arange(ENTERING))
+        joints = np.array([BODY.skeleton.joints(pose) for pose in own])
+        assert np.nanmedian(np.linalg.norm(result.joints - joints, axis=2)) < 0.1  # coarse settings
 
 
 def test_somebody_who_enters_later_can_be_chosen(second: tuple[Result, tuple[Subject, ...]]) -> None:
     found, subjects = second
     np.testing.assert_array_equal(found.frames, np.arange(ENTERING))
     (here,) = np.nonzero(found.status != Status.ABSENT)
-    assert 3 < here[0] < 16 and not (found.status == Status.LOST).any() and np.isfinite(found.pose).all()
+    assert 3 < here[0] < 16 and not (found.status == Status.LOST).any()
+    np.testing.assert_array_equal(np.isfinite(found.pose).all(axis=1), found.status != Status.ABSENT)
     np.testing.assert_array_equal(here, np.arange(here[0], 17))
     joints = np.array([BODY.skeleton.joints(pose) for pose in ENTER[1][here]])
     assert np.median(np.linalg.norm(found.joints[here] - joints, axis=2)) < 0.1  # coarse settings

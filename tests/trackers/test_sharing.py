@@ -14,8 +14,8 @@ from tk.kernels.mask_values import OTHERS
 from tk.kernels.raycast import FAR
 from tk.model.cues.part_colors import RenderedBody, color_bins
 from tk.model.cues.ray_costs import RayGrid
+from tk.people.share import NOBODY, assign, enlarged
 from tk.trackers.protocol import Frame
-from tk.trackers.sharing import NOBODY, assign, enlarged
 
 RIG = ring_of_cameras(4, width=160, height=200)
 GRID, EXACT = RayGrid(RIG, 50), RayGrid(RIG, 200)

@@ -81,7 +81,7 @@ def _track(job: Job, reporter: _Reporter) -> Outcome:
     return Outcome(
         DONE,
         frames=summary.frames,
-        lost=int((~known).sum()),
+        lost=summary.lost,
         suspect=summary.suspect,
         tracked_now=summary.tracked_now,
         error_cm=error_cm,

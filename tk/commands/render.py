@@ -55,7 +55,7 @@ def render(
         loaded = read_result(result)
         if not any(map(len, loaded.people)):
             raise ResultError(f"{result}: has no frames")
-        chosen = _parse_frames(frames, loaded.aligned()[0].frames.tolist())
+        chosen = _parse_frames(frames, loaded.frames.tolist())
         view = view or ("overlay" if capture else "3d")
         opened = None if capture is None else open_capture(capture, cameras, "none", loaded.resampled)
         if png is not None and (view != "overlay" or opened is None):

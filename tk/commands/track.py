@@ -143,7 +143,7 @@ def end(output: Path, summary: Summary, quiet: bool, as_json: bool) -> None:
         )
     wrong = summary.lost + summary.suspect
     if summary.frames and not quiet:
-        rare = {"suspect": summary.suspect, "with nobody in view": summary.frames - summary.present}
+        rare = {"suspect": summary.suspect, "absent": summary.frames - summary.present}
         counts = [f"{summary.lost} lost", *(f"{count} {what}" for what, count in rare.items() if count)]
         several = f" of {summary.people} people" if summary.people > 1 else ""
         parts = [f"{summary.frames} frames{several} in {output}", *counts, *_expected_error(output)]

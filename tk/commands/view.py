@@ -28,7 +28,7 @@ def view(result: Path, capture: Path | None, frame: int | None, screenshot: Path
     from tk.view.contents import Contents
     from tk.view.window import Window, require_display
 
-    people = People(read_result(result).aligned())
+    people = People(read_result(result).people)
     loaded = people.first
     if not len(loaded):
         raise ResultError(f"{result}: has no frames")

@@ -103,7 +103,6 @@ def motion_of(result: Result, smoothed: bool = False) -> tuple[Motion, tuple[str
     name = text_of(path.stem)
     if result.person or result.others:
         name += f"_{result.person}"
-        result = _with_absent_frames(result)
     name += "_smoothed" * smoothed
     bridged = np.zeros(len(result), dtype=bool)
     if is_made_here := smoothed and result.smoothed is None:
@@ -160,23 +159,6 @@ def motion_of(result: Result, smoothed: bool = False) -> tuple[Motion, tuple[str
         dimensions=dimensions,
         T_world_body=skeleton.T_world_body,
     ), tuple(notes)
-
-
-def _with_absent_frames(result: Result) -> Result:
-    """Return the result of one of several people with rows for the frames in which the person is absent."""
-    if not len(result):
-        raise ResultError(f"{result.path}: the person is in no frame")
-    frames = np.arange(result.frames[0], result.frames[-1] + 1)
-    rows = np.searchsorted(result.frames, frames, side="right") - 1
-    absent = result.frames[rows] != frames
-    time = result.time[rows] + (frames - result.frames[rows]) / result.meta.fps
-    smoothed = result.smoothed
-    if smoothed is not None:
-        smoothed = {name: values[rows] for name, values in smoothed.items()}
-        smoothed["bridged"] &= ~absent
-    result = result.at_rows(rows)
-    status = np.where(absent, Status.ABSENT, result.status)
-    return replace(result, frames=frames, time=time, status=status, smoothed=smoothed)
 
 
 def _held(known: NDArray[np.bool_]) -> NDArray[np.int64]:

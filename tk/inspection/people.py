@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from tk.io.captures.capture import Capture
 from tk.model.cues.ray_costs import RayGrid
-from tk.model.people import LocatedPerson, PeopleFinder, order_people
+from tk.people.choose import in_order
+from tk.people.find import LocatedPerson, PeopleFinder
+from tk.people.hulls import owners_by_hulls
 from tk.trackers.contour_finder import CHOICE_ROWS
 from tk.trackers.protocol import Frame
-from tk.trackers.sharing import UNKNOWN_BY_HULLS, assign, cast_points
 
 Float = NDArray[np.float64]
 
@@ -91,8 +92,9 @@ class PeopleWatch:
 
     Attributes:
         entered: frame of the first look in which the working volume was not empty; 0 if it is the first of all, None
-            before it. People who are then in the volume have the first numbers, in the order of :func:`order_people`,
-            as in `tk track`; then come those who enter it later, in this order, and last those who never do.
+            before it. People who are then in the volume have the first numbers, as in `tk track`, see
+            :func:`tk.people.choose.in_order`; then come those who enter it later, in this order, and last those who
+            never do.
     """
 
     def __init__(self, capture: Capture, span: range) -> None:
@@ -122,9 +124,9 @@ class PeopleWatch:
         found = self._finder.find(masks, uncertain, near)
         enter = self.entered is None and not self._finder.is_empty(masks, found)
         if enter:
-            capture, self.entered = self._capture, index if index > self._start else 0
-            subject = capture.setup().subjects[0]
-            found = order_people(found, capture.volume, subject.height_m, subject.position)
+            self.entered = index if index > self._start else 0
+            frame = Frame(index, np.empty((len(masks), 0, 0, 3), np.uint8), masks, uncertain)
+            found = in_order(self._finder, self._capture.setup(), [frame], found)
         before = np.array([path.last[1].position for path in self._open]).reshape(-1, 3)
         now = np.array([person.position for person in found]).reshape(-1, 3)
         distance = np.linalg.norm(before[:, None] - now[None], axis=2)
@@ -150,10 +152,8 @@ class PeopleWatch:
         found = self._finder.find(masks)
         by_distance = sorted(found, key=lambda person: float(np.linalg.norm(person.position - last.position)))
         grid = RayGrid(rig, CHOICE_ROWS)
-        hulls = [cast_points(rig, grid, person.points, person.voxel_m) for person in by_distance]
         whole = Frame(index, np.empty((len(rig), 0, 0, 3), np.uint8), masks)
-        owners = assign(rig, grid, hulls, whole, UNKNOWN_BY_HULLS)
-        return owners.share(whole, 0, False).masks
+        return owners_by_hulls(rig, grid, by_distance, whole).share(whole, 0).masks
 
     def people(self) -> tuple[PersonReport, ...]:
         """Return the people. Somebody who was seen only for a moment is left out; the numbers of the people in the look

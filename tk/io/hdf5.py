@@ -33,6 +33,8 @@ FILTERS = (1, 2, 3, 32000)
 #: chunks that were never written)
 MAX_COMPRESSION, MAX_UNWRITTEN_BYTES = 100, 65_536
 
+_FIRST = b"/people/0/"  # where the links of a result lead
+
 _HEAP = b"GCOL\x01\x00\x00\x00"  # start of a heap of texts: signature, version, reserved
 
 _NUMBERS = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.ENUM)  # h5py stores bool as an enumeration
@@ -225,7 +227,7 @@ class Hdf5Reader:
                     self.fail(f"holds more than {MAX_OBJECTS} groups and datasets; the file is damaged")
 
     def _links(self, group: h5py.h5g.GroupID, name: str) -> list[str]:
-        """Return the names in a group; refuse links."""
+        """Return the names in a group. Links of the top level to person 0 are ignored, others refused."""
         found: list[tuple[bytes, int]] = []
 
         def take(link: bytes, info: h5py.h5l.LinkInfo) -> bool | None:  # HDF5 does not pass on its exceptions
@@ -236,10 +238,11 @@ class Hdf5Reader:
         if len(found) > MAX_OBJECTS:
             self.fail(f"holds more than {MAX_OBJECTS} groups and datasets; the file is damaged")
         for link, kind in found:
-            if kind != h5py.h5l.TYPE_HARD:
+            own = kind == h5py.h5l.TYPE_SOFT and not name and group.links.get_val(link) == _FIRST + link
+            if kind != h5py.h5l.TYPE_HARD and not own:
                 path = f"/{name}/{link.decode()}".replace("//", "/")
                 self.fail(f"{path} is a link; replace it by a copy of the data")
-        return [link.decode() for link, _ in found]
+        return [link.decode() for link, kind in found if kind == h5py.h5l.TYPE_HARD]
 
     def _check_storage(self, name: str, dataset: h5py.h5d.DatasetID) -> tuple[int, ...]:
         """Return the shape of a dataset; refuse external data and more data than the file can hold."""

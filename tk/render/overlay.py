@@ -62,7 +62,7 @@ class Overlay:
     def __init__(self, capture: Capture, result: Result, widest: int = WIDEST, full: bool = False) -> None:
         if not len(result.frames):
             raise ResultError(f"{result.path}: has no frames")
-        self.people = People(result.aligned())
+        self.people = People(result.people)
         result = self.people.first
         last = int(result.frames.max())
         if last >= capture.frame_count:

@@ -22,7 +22,7 @@ _SQUARE_M, _SQUARES = 0.5, 6  # side of the floor's squares, and their number on
 
 @dataclass(frozen=True)
 class People:
-    """The people of a result, with the same frames, see :meth:`~tk.io.results.data.Result.aligned`."""
+    """The people of a result, with the same frames."""
 
     results: tuple[Result, ...]
 

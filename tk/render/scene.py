@@ -65,7 +65,7 @@ class Scene:
         if hull and result.hull is None:
             raise ResultError(f"{result.path}: holds no hull", hint="track with --method volumetric --store-hull")
         self.hull = result.hull if hull else None
-        self.people = People((result,) if hull else result.aligned())
+        self.people = People((result,) if hull else result.people)
         self._legend = Legend(self.people, WIDTH)
         self.rig = rig or (result.cameras.rig if result.cameras else None)
         self._middles, reach = _followed(self.people.figures, result.meta.fps)

@@ -51,7 +51,7 @@ def describe(result: Result, rig: Rig | None = None, truth: Path | None = None) 
         truth: the ground truth; the file need not exist.
     """
     meta = result.meta
-    whole = result.aligned()
+    whole = result.people
     step = -(-len(whole) * len(whole[0]) // _MOST_ROWS)
     people = People(tuple(person.at_rows(np.arange(0, len(person), step)) for person in whole))
     first = people.first

@@ -31,7 +31,7 @@ def build_page(
         rig: the cameras, if the result does not have them.
         truth: the ground truth; the file need not exist.
     """
-    data, rows = describe(result, rig, truth), result.aligned()[0]
+    data, rows = describe(result, rig, truth), result
     shown = [
         {
             **picture,

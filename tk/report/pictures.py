@@ -31,9 +31,8 @@ class Choice:
 
 def choose_rows(result: Result, frames: range | None = None) -> list[Choice]:
     """Return the first frame in which anybody is lost, the worst and typical frames; without E_S, frames spread over
-    the result. Only ``frames``, by default all, are chosen. Rows are those of
-    :meth:`~tk.io.results.data.Result.aligned`."""
-    people = result.aligned()
+    the result. Only ``frames``, by default all, are chosen."""
+    people = result.people
     count = len(people[0])
     there = [np.isfinite(person.joints).any(axis=(1, 2)) for person in people]
     lost = np.any([~person.has_pose & known for person, known in zip(people, there, strict=True)], axis=0)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -26,41 +27,59 @@ _WORSE, _MENDED = 1.3, 0.8
 _EXACT = 0.01
 
 
-def whole_delays(
-    body: ConeBody, rig: Rig, masks: Callable[[int], NDArray[np.uint8]], tracked: TrackedPoses
-) -> NDArray[np.int64]:
+@dataclass(frozen=True)
+class TrackedPerson:
+    """A person who was tracked: the body, the masks, and the poses, in a world in which z is up."""
+
+    body: ConeBody
+    masks: Callable[[int], NDArray[np.uint8]]  # (C, H, W) of a frame
+    tracked: TrackedPoses
+
+
+def whole_delays(people: Sequence[TrackedPerson], rig: Rig) -> NDArray[np.int64]:
     """Return (C,) whole frames by which each video is late; 0 if the recording is too short to find its delay.
 
-    The body explains the masks of a late video worse than those of the others, and those of some frames earlier well.
-    Body, cameras and poses are in a world in which z is up.
+    The bodies explain the masks of a late video worse than those of the others, and those of some frames earlier well.
+    The cameras are in the world of the poses.
     """
-    frames, stored = tracked.frames, set(tracked.frames.tolist())
     grid = RayGrid(rig, SCREEN_ROWS)
-    sampled = cache(lambda frame: grid.sample(masks(frame)).copy())
-
-    @cache
-    def body_in(i: int) -> NDArray[np.bool_]:
-        return np.asarray(grid.render(body, tracked.poses[i][None]).label[0] > 0)
-
+    shares_of = [_shares_by_delay(person, grid, -(-DELAY_FRAMES // len(people))) for person in people]
     late, unknown, reach = np.zeros(len(rig), np.int64), np.ones(len(rig), np.bool_), REACH
     while unknown.any() and reach <= MOST:
-        shifts = range(-reach, reach + 1)
-        rows = np.flatnonzero(tracked.usable & [all(frame - n in stored for n in shifts) for frame in frames.tolist()])
-        if not len(rows):
+        shares = np.concatenate([of_delays(range(-reach, reach + 1)) for of_delays in shares_of], axis=1)
+        if not shares.shape[1]:
             break
-        rows = rows[np.unique(np.linspace(0, len(rows) - 1, DELAY_FRAMES).round().astype(int))]
-        bodies = [body_in(i) for i in rows.tolist()]
-        shares = np.array([
-            [residual_of(drawn, m >= PERSON, m == OTHERS).sum(axis=1)
-             for drawn, m in zip(bodies, (sampled(frame - n) for frame in frames[rows].tolist()), strict=True)]
-            for n in shifts
-        ])  # fmt: skip
         best, mended = _best_delays(shares)
         inside = np.abs(best) < reach
         late[unknown & inside & mended] = best[unknown & inside & mended]
         unknown &= ~inside
         reach *= 2
     return late
+
+
+def _shares_by_delay(person: TrackedPerson, grid: RayGrid, count: int) -> Callable[[range], NDArray[np.float64]]:
+    """Return a function from N delays to the shares (N, R, C) of wrong pixels in R frames, at most ``count``, of which
+    all masks with these delays are stored."""
+    tracked = person.tracked
+    frames, stored = tracked.frames, set(tracked.frames.tolist())
+    sampled = cache(lambda frame: grid.sample(person.masks(frame)).copy())
+
+    @cache
+    def body_in(i: int) -> NDArray[np.bool_]:
+        return np.asarray(grid.render(person.body, tracked.poses[i][None]).label[0] > 0)
+
+    def shares(delays: range) -> NDArray[np.float64]:
+        rows = np.flatnonzero(tracked.usable & [all(frame - n in stored for n in delays) for frame in frames.tolist()])
+        if len(rows):
+            rows = rows[np.unique(np.linspace(0, len(rows) - 1, count).round().astype(int))]
+        found = np.empty((len(delays), len(rows), len(grid.rig)))
+        for k, n in enumerate(delays):
+            for r, i in enumerate(rows.tolist()):
+                seen = sampled(int(frames[i]) - n)
+                found[k, r] = residual_of(body_in(i), seen >= PERSON, seen == OTHERS).sum(axis=1)
+        return found
+
+    return shares
 
 
 def _best_delays(shares: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:

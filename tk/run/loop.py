@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -20,15 +20,16 @@ from tk.io.results.data import HullPoints, Value
 from tk.io.results.reader import as_damage_error, read_result
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
-from tk.run.member import Tracked
+from tk.people.people import People, PeopleState
+from tk.people.person import Tracked
 from tk.run.offline import REFINED
-from tk.run.people import People, PeopleState
 from tk.run.plan import Plan
 from tk.run.prefetch import Observed
 from tk.threads import one_thread
 from tk.trackers.protocol import Estimate, Frame, shows_person, two_pass
 
 _LOG = logging.getLogger(__name__)
+Row = dict[str, ArrayLike]
 
 # Seconds between two writes to the file; frames finished within this time are written and reported together. A shorter
 # time costs more writes; a longer one loses more frames when the process is killed.
@@ -91,12 +92,13 @@ class Loop:
     ) -> None:
         self.plan, self.output, self.masks, self._note = plan, output, masks, note
         self.tracked = 0
-        self._held: list[dict[int, dict[str, ArrayLike]]] = []  # rows of frames that are not in the file yet
-        self.people = People(plan.task, plan.tracker, note)
+        self._held: list[tuple[Row, dict[int, Row]]] = []  # of frames that are not in the file yet
+        task = plan.task
+        self.people = People(task.setup, task.settings, task.options.people, plan.tracker, note)
 
     def frames(self) -> Iterator[tuple[Estimate, ...]]:
-        """Start or restore the trackers, step them to the end and yield the estimates of each frame's people; they are
-        in the file already, except those before the first person, which are written with that person's first frame.
+        """Start or restore the trackers, step them to the end and yield the estimates of all people in each frame; they
+        are in the file already, except those before the first person, which are written with that person's first frame.
 
         Raises:
             TkError: bad input, or nobody is found.
@@ -190,13 +192,13 @@ class Loop:
                     continue
                 stepped = time.perf_counter()
                 total = laps["wait"] + writing + stepped - started
-                estimates = tuple(replace(e, timing={**laps, **e.timing, "total": total}) for e in estimates)
                 due = not output or stepped - written > WRITE_EVERY_S
                 if output:
-                    self._held.append({e.person: _row(e, self.plan.task.options.store_hull) for e in estimates})
+                    rows = {e.person: _row(e, self.plan.task.options.store_hull) for e in estimates}
+                    self._held.append((_run_row(estimates, {**laps, "total": total}), rows))
                     if self.people.members:
                         self._write(output, due)
-                finished.append(estimates)
+                finished.append(tuple(replace(e, timing={**laps, **e.timing, "total": total}) for e in estimates))
                 writing = time.perf_counter() - stepped
                 if due:
                     written = stepped + writing
@@ -214,25 +216,22 @@ class Loop:
             if member.number >= len(models) or not models[member.number]:
                 output.writer.write_model(member.tracker.model(), person=member.number)
         *earlier, last = self._held
-        for absent in earlier:  # with the nearest pose, as later absent frames
-            rows = {n: row | {k: last[n][k] for k in ("pose", "joints/position")} for n, row in absent.items()}
-            output.writer.append(rows, flush=False)
-        output.writer.append(last, self._state(output), flush=flush)
+        for before in earlier:
+            output.writer.append(*before, flush=False)
+        output.writer.append(*last, self._state(output), flush=flush)
         self.tracked += len(self._held)
         self._held.clear()
 
     def _step(self, observation: Frame) -> tuple[Estimate, ...] | None:
-        """Step all trackers; return the estimates of the people who are present, None before the first frame to be
+        """Step all trackers; return the estimates of the people in the result, None before the first frame to be
         written."""
         with one_thread():
             answers = self.people.step(observation)
         if observation.index < self.plan.begin:
             return None
-        present = []
+        found = []
         for number, answer in answers.items():
             estimate = answer.estimate
-            if estimate.status == "absent" and self.people.several:
-                continue
             if self.masks is not None:
                 self.masks[number].put(observation.index, self._kept(answer))
             # masks are large, and a view into the ring of frames: an estimate must not keep them
@@ -241,8 +240,8 @@ class Loop:
             if whole.landmarks is not None:
                 seen = self.plan.task.setup.rig.recorded_pixels(whole.landmarks)
                 whole = replace(whole, landmarks=seen)
-            present.append(whole)
-        return tuple(present)
+            found.append(whole)
+        return tuple(found)
 
     def _kept(self, answer: Tracked) -> NDArray[np.uint8]:
         """Return the cleaned masks (C, H, W) of a frame, also of cameras that disagree: they may be refined."""
@@ -282,11 +281,18 @@ def _raising(error: TkError) -> Iterator[Observed]:
     yield
 
 
-def _row(estimate: Estimate, store_hull: bool) -> dict[str, ArrayLike]:
-    """Return an estimate's row of the result file."""
+def _run_row(estimates: Sequence[Estimate], laps: Mapping[str, float]) -> Row:
+    """Return the row of the run in the result file; ``laps``: seconds by stage without those of the trackers."""
+    first, seconds = estimates[0], dict(laps)
+    for estimate in estimates:
+        for stage, lap in estimate.timing.items():
+            seconds[stage] = seconds.get(stage, 0.0) + lap
+    return {"frames": first.frame, "time": first.time, **{f"timing/{stage}": lap for stage, lap in seconds.items()}}
+
+
+def _row(estimate: Estimate, store_hull: bool) -> Row:
+    """Return a person's row of the result file."""
     row: dict[str, ArrayLike | None] = {
-        "frames": estimate.frame,
-        "time": estimate.time,
         "pose": estimate.pose,
         "joints/position": estimate.joints,
         "joints/sigma": estimate.sigma,
@@ -303,7 +309,6 @@ def _row(estimate: Estimate, store_hull: bool) -> dict[str, ArrayLike]:
         "status": int(Status[estimate.status.upper()]),
         "objective": estimate.objective,
         "iterations": estimate.iterations,
-        **{f"timing/{stage}": seconds for stage, seconds in estimate.timing.items()},
     }
     if store_hull and estimate.surface is not None:
         points = HullPoints.of(estimate.surface)

@@ -5,26 +5,27 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.io.captures.mask_store import MaskStore, MaskStores
-from tk.io.results.data import Result, UsedCameras, Value
+from tk.io.results.data import Result, UsedCameras
 from tk.io.results.revision import Revision
 from tk.io.results.status import Status
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.bundle import TrackedPoses
+from tk.model.cameras.camera import Rig
 from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
-from tk.run.delays import retimed, retimed_landmarks
-from tk.run.identity import COLUMNS, doubtful, exchanged, exchanged_masks, report
-from tk.run.member import Member
-from tk.run.people import People
+from tk.people.identity import COLUMNS, doubtful, exchanged, exchanged_masks, report
+from tk.people.people import People
+from tk.run.delays import TrackedPerson, retimed, retimed_landmarks
+from tk.run.draft import Draft, held, without_absent
 from tk.run.prefetch import open_observations
 from tk.run.refinement import compare_cameras, refine_if_inconsistent
-from tk.run.second_run import Run, Used, explains_better, track_again
+from tk.run.second_run import Run, explains_better, track_again
 from tk.run.task import Task
 from tk.trackers.judgement import FrameEvidence, FrameJudge, depth_known, judge_frames
 from tk.trackers.protocol import Estimate, TwoPassTracker, two_pass, without_cameras
@@ -68,7 +69,7 @@ def finish(
     note: Note,
     within: Callable[[float], None],
 ) -> Finished:
-    """Return what needs all frames, see :meth:`_Finisher.finish`, after people who were mixed up are exchanged.
+    """Return what needs all frames, see :class:`_Finisher`, after people who were mixed up are exchanged.
 
     Args:
         found: each person's result of the first pass.
@@ -78,83 +79,57 @@ def finish(
         within: receives the share of a long stage that is done.
     """
     members, contacts = people.members, people.contacts
-    cameras = UsedCameras(task.setup.rig, np.array(task.source.time_offset_s))
-    finisher = _Finisher(task, len(members) == 1, note, within, cameras)
-    results = exchanged(found, contacts)
+    kept = [held(person) for person in found]
+    results = exchanged(kept, contacts)
     for line in report(contacts):
         note(line)
-    revisions = {}
+    drafts = []
     for member in members:
-        result, number = results[member.number], member.number
-        if not people.has_segments:
-            _report(result.frames, result.reason, note, number, finisher.alone)
-            continue
-        draft = _Draft(result, ~result.has_pose, result.has_pose & doubtful(result, contacts))
-        if result is not found[number]:
+        result = results[member.number]
+        draft = Draft(member, result, member.tracker, ~result.has_pose, result.has_pose & doubtful(result, contacts))
+        if result is not kept[member.number]:
             columns = {dataset: getattr(result, name) for dataset, name in COLUMNS.items()}
             draft.columns = {dataset: values for dataset, values in columns.items() if values is not None}
-        own = None if masks is None else exchanged_masks(number, contacts, masks, result.frames)
-        revisions[number] = finisher.finish(member, draft, own)
-        _report(result.frames, draft.current("evidence/reason"), note, number, finisher.alone)
+        if masks is not None:
+            draft.masks = exchanged_masks(member.number, contacts, masks, result.frames)
+        drafts.append(draft)
+    revisions, finisher = {}, _Finisher(task, len(members) == 1, note, within, task.setup.rig)
+    if people.has_segments:
+        finisher.second_pass([draft for draft in drafts if finisher.has_masks(draft)])
+    for draft in drafts:
+        number, reasons = draft.member.number, draft.current("evidence/reason")
+        if people.has_segments:
+            revisions[number] = without_absent(finisher.revision(draft), draft.result.status == Status.ABSENT)
+            reasons = draft.current("evidence/reason")
+        _report(draft.result.frames, reasons, note, number, finisher.alone)
     return Finished(revisions, finisher.cameras.recorded() if revisions else None)
 
 
 @dataclass
-class _Draft:
-    """A person's result while it is finished.
-
-    Attributes:
-        result: of the first pass.
-        lost: (F,) frames without a pose.
-        unclear: (F,) frames that are suspect, whatever their residual is.
-        columns: what differs from the file, by dataset.
-    """
-
-    result: Result
-    lost: NDArray[np.bool_]
-    unclear: NDArray[np.bool_]
-    columns: dict[str, NDArray[Any]] = field(default_factory=dict)
-
-    def current(self, dataset: str) -> Any:
-        """Return one of :data:`~tk.run.identity.COLUMNS` as it is now; None if the result has none."""
-        return self.columns.get(dataset, getattr(self.result, COLUMNS[dataset]))
-
-    def replace(self, rows: NDArray[np.int64], estimates: Sequence[Estimate]) -> None:
-        """Take other estimates for some frames; the first frame stays "initialised"."""
-        evidence = ("reason", "found", "origin", "sigma", "camera")
-        datasets = ("pose", "residual", "objective", *(f"evidence/{name}" for name in evidence))
-        columns = {dataset: self.current(dataset).copy() for dataset in datasets}
-        for row, e in zip(rows, estimates, strict=True):
-            columns["pose"][row], columns["objective"][row] = e.pose, e.objective
-            columns["evidence/sigma"][row], columns["residual"][row] = e.deviation, e.residual
-            columns["evidence/reason"][row], columns["evidence/found"][row] = e.reason, e.found
-            if e.cameras is not None:  # else those of the first pass were left out
-                columns["evidence/camera"][row] = e.cameras
-            if columns["evidence/origin"][row] != Status.INITIALISED:
-                columns["evidence/origin"][row] = e.origin
-            self.lost[row] = e.status == "lost"
-        self.columns |= columns
-
-
-@dataclass
 class _Finisher:
-    """Finishes people one after the other. Person 0 decides whether the cameras are refined."""
+    """Finishes people: cameras are compared and refined about all of them, then each has a second pass."""
 
     task: Task
     alone: bool  # whether the result has one person
     note: Note
     within: Callable[[float], None]
-    cameras: UsedCameras
+    rig: Rig  # as used
+    late: NDArray[np.int64] = field(init=False)  # (C,) whole frames by which each video is late, as found
+    offset_frames: Float = field(init=False)  # (C,) the same, not rounded
 
-    def finish(self, member: Member, draft: _Draft, masks: MaskStore | None) -> Revision:
-        """Return what needs all frames of a person: the second pass; segments, feet and angles; the smoothed copy."""
-        tracker, setup = member.tracker, self.task.setup
-        model: Mapping[str, Value] | None = None
-        again = two_pass(tracker)
-        if again is not None and masks is not None and self._complete(masks, member.number, again, draft.result):
-            tracker = self._second_pass(member, again, masks, draft)
-            model = {**tracker.model(), REFINED: 1}
-        self._judge(draft, model is not None)
+    def __post_init__(self) -> None:
+        self.late, self.offset_frames = np.zeros(len(self.rig), np.int64), np.zeros(len(self.rig))
+
+    @property
+    def cameras(self) -> UsedCameras:
+        """The cameras as used, and their delays."""
+        offsets = np.array(self.task.source.time_offset_s) + self.offset_frames / self.task.setup.fps
+        return UsedCameras(self.rig, offsets)
+
+    def revision(self, draft: Draft) -> Revision:
+        """Return what all frames of a person give: status and sigma; segments, feet and angles; the smoothed copy."""
+        tracker, setup = draft.tracker, self.task.setup
+        self._judge(draft)
         _LOG.info("angles, feet, and the smoothed copy")
         body, poses = tracker.body.standing(setup.up), draft.current("pose")
         # poses of the first pass stay as they are
@@ -163,15 +138,23 @@ class _Finisher:
         columns = draft.columns | {name: v for name, v in _columns(body, poses, seen).items() if name not in kept}
         filtered = smooth(body.skeleton, poses, ~draft.lost, setup.fps)
         smoothed = {**_columns(body, filtered.poses, seen), "bridged": filtered.bridged}
-        return Revision(columns, smoothed, model)
+        return Revision(columns, smoothed, {**tracker.model(), REFINED: 1} if draft.refined else None)
 
-    def _complete(self, masks: MaskStore, person: int, tracker: TwoPassTracker, result: Result) -> bool:
+    def has_masks(self, draft: Draft) -> bool:
         """Return whether a person's masks of all frames are known. Those that an earlier run has used are made again if
         nobody else is tracked."""
-        missing = [int(f) for f in result.frames if int(f) not in masks]
+        tracker, masks, result = two_pass(draft.tracker), draft.masks, draft.result
+        if tracker is None or masks is None:
+            return False
+        absent = result.status == Status.ABSENT
+        for frame in result.frames[absent].tolist():
+            if frame not in masks:
+                masks.put(frame, np.zeros((len(self.rig), *self.rig.frame_shape), np.uint8))
+        missing = [frame for frame in result.frames[~absent].tolist() if frame not in masks]
         if missing and not self.alone:
             self.note(
-                f"person {person}: the second pass is omitted, because an earlier run kept no masks of each person"
+                f"person {draft.member.number}: the second pass is omitted, because an earlier run kept no masks of "
+                "each person"
             )
             return False
         if missing:
@@ -180,32 +163,37 @@ class _Finisher:
                     masks.put(observation.index, tracker.cleaned(tracker.without_foreign(observation).masks))
         return True
 
-    def _second_pass(self, member: Member, tracker: TwoPassTracker, masks: MaskStore, draft: _Draft) -> TwoPassTracker:
-        """Optimise the poses of a draft by what all frames show. Return the tracker with the final cameras and body.
+    def second_pass(self, drafts: Sequence[Draft]) -> None:
+        """Optimise the poses of drafts by what all frames show.
 
-        The body is fitted to frames of the whole recording: only bent elbows and knees show where these are.
+        A body is fitted to frames of the whole recording: only bent elbows and knees show where these are.
         """
-        subject = member.subject
-        if self.alone and subject.init is None:  # a given pose shows where the front is
-            tracker = self._with_true_heading(tracker, masks, draft, subject.height_m)
-        tracker, masks = self._with_final_cameras(member, tracker, masks, draft)
-        _LOG.info("second pass")
-        poses, residual, precise = tracker.second_pass(
-            masks.sequence(draft.result.frames),
-            draft.current("pose"),
-            draft.lost,
-            draft.current("residual"),
-            subject.height_m,
-            self._landmarks(draft, self._late),
-            keep_body=subject.body is not None,
-            report=self.within,
-        )
-        sigma = sigma_of_both(draft.current("evidence/sigma"), precise)
-        draft.columns |= {"pose": poses, "residual": residual, "evidence/sigma": sigma}
-        return tracker
+        if not drafts:
+            return
+        for draft in drafts if self.alone else ():
+            subject = draft.member.subject
+            if subject.init is None:  # a given pose shows where the front is
+                draft.tracker = self._with_true_heading(*draft.used, draft, subject.height_m)
+        self._refine_cameras(drafts)
+        for draft in drafts:
+            (tracker, masks), subject = draft.used, draft.member.subject
+            _LOG.info("second pass")
+            poses, residual, precise = tracker.second_pass(
+                masks.sequence(draft.result.frames),
+                draft.current("pose"),
+                draft.lost,
+                draft.current("residual"),
+                subject.height_m,
+                self._landmarks(draft, self.late),
+                keep_body=subject.body is not None,
+                report=self.within,
+            )
+            sigma = sigma_of_both(draft.current("evidence/sigma"), precise)
+            draft.columns |= {"pose": poses, "residual": residual, "evidence/sigma": sigma}
+            draft.refined = True
 
     def _with_true_heading(
-        self, tracker: TwoPassTracker, masks: MaskStore, draft: _Draft, height_m: float | None
+        self, tracker: TwoPassTracker, masks: MaskStore, draft: Draft, height_m: float | None
     ) -> TwoPassTracker:
         """If the opposite heading is not improbable, track the person again with both headings, each with its body;
         keep the more probable one. Return the tracker of the heading that is kept.
@@ -217,7 +205,7 @@ class _Finisher:
             return tracker
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, HEADING_FRAMES).round().astype(int))]
         poses, unused = draft.current("pose"), np.isnan(draft.current("residual")[..., 0])
-        landmarks = self._landmarks(draft, self._late)
+        landmarks = self._landmarks(draft, self.late)
 
         def seen(rows: NDArray[np.int64]) -> tuple[list[NDArray[np.uint8]], Float | None]:
             """Return the masks and landmarks of frames by the cameras that were used."""
@@ -250,7 +238,7 @@ class _Finisher:
         self.note("the person faces the other way than the first frames seemed to show: tracked again")
         return hypotheses[best]
 
-    def _tracked_by(self, trackers: Sequence[TwoPassTracker], draft: _Draft, unused: NDArray[np.bool_]) -> list[_Draft]:
+    def _tracked_by(self, trackers: Sequence[TwoPassTracker], draft: Draft, unused: NDArray[np.bool_]) -> list[Draft]:
         """Track the frames of a draft by trackers that have been started, side by side, without the cameras (F, C) that
         are unused; return a draft of each."""
         present = np.flatnonzero(draft.result.status != Status.ABSENT)
@@ -266,57 +254,55 @@ class _Finisher:
                         found_one = judge.judge(frame.index, tracker.step(used))
                         estimates.append(replace(found_one, masks=None, drawn=None))  # these are large
                     self.within(len(found[0]) / len(rows))
-        drafts = [replace(draft, lost=draft.lost.copy(), columns=dict(draft.columns)) for _ in trackers]
+        drafts = [draft.copy() for _ in trackers]
         for one, estimates in zip(drafts, found, strict=True):
             one.replace(present, estimates)
         return drafts
 
-    def _with_final_cameras(
-        self, member: Member, tracker: TwoPassTracker, masks: MaskStore, draft: _Draft
-    ) -> tuple[TwoPassTracker, MaskStore]:
-        """Return the tracker with refined cameras, and synchronised masks, if the cameras disagree about person 0 and
-        ``settings.refine`` is True, else both as they are. Other people take over what person 0 has decided.
+    def _refine_cameras(self, drafts: Sequence[Draft]) -> None:
+        """Refine the cameras, and synchronise the masks, if the cameras disagree about the people and
+        ``settings.refine`` is True.
 
         A camera that has been moved during the recording has no one place and is not compared.
         """
-        task, result = self.task, draft.result
         _LOG.info("second pass: comparing the cameras")
-        tracked = TrackedPoses(result.frames, draft.current("pose"), ~draft.lost)
-        compared = masks.without(member.monitor.moved)
-        agreement = compare_cameras(tracker, compared, tracked)
+        tracker = drafts[0].used[0]
+        world, people = tracker.world, [self._seen(draft) for draft in drafts]
+        agreement = compare_cameras(people, tracker.views)
         if apart := "" if agreement is None else agreement.contradiction:
             self.note(f"{apart}: all frames are suspect")
-            draft.unclear = ~draft.lost
-        if member.number:
-            taken = tracker.with_cameras(self.cameras.rig), retimed(masks, result.frames, self._late)
-            if self.cameras.rig is not task.setup.rig:
-                for line in self._track_again(member, draft, (tracker, masks), taken, self._late) or ():
-                    self.note(line)
-            return taken
-        if agreement is None or apart or not task.settings.refine:
-            return tracker, masks
-        refined = refine_if_inconsistent(tracker, agreement, compared, tracked)
+            for draft in drafts:
+                draft.unclear = ~draft.lost
+        if agreement is None or apart or not self.task.settings.refine:
+            return
+        refined = refine_if_inconsistent(people, world.rig, agreement)
         if refined is None:
-            return tracker, masks
-        late = np.round(refined.offset_frames).astype(np.int64)
-        now = refined.tracker, retimed(masks, result.frames, late)
-        lines = self._track_again(member, draft, (tracker, masks), now, late)
-        if lines is None:
+            return
+        rig, late = world.rig_out(refined.rig), np.round(refined.offset_frames).astype(np.int64)
+        found = [self._with_cameras(draft, rig, late) for draft in drafts]
+        if any(done is None for done in found):
             _LOG.info("the first pass explains the images better than one with the refined cameras")
-            return tracker, masks
-        for line in (refined.message, *lines):
-            self.note(line)
-        offsets = self.cameras.time_offset_s + refined.offset_frames / task.setup.fps
-        self.cameras = UsedCameras(refined.tracker.rig, offsets)
-        return now
+            return
+        self.rig, self.late, self.offset_frames = rig, late, refined.offset_frames
+        self.note(refined.message)
+        for draft, done in zip(drafts, found, strict=True):
+            assert done is not None
+            changed, lines = done
+            draft.tracker, draft.masks = changed.tracker, changed.masks
+            draft.lost, draft.columns = changed.lost, changed.columns
+            for line in lines:
+                self.note(line if self.alone else f"person {draft.member.number}: {line}")
 
-    @property
-    def _late(self) -> NDArray[np.int64]:
-        """(C,) whole frames by which each video is late, as found."""
-        found = self.cameras.time_offset_s - self.task.source.time_offset_s
-        return np.round(found * self.task.setup.fps).astype(np.int64)
+    def _seen(self, draft: Draft) -> TrackedPerson:
+        """Return what the cameras are compared by."""
+        tracker, masks = draft.used
+        poses = tracker.world.poses_in(draft.current("pose"))
+        compared = masks.without(draft.member.monitor.moved)
+        return TrackedPerson(
+            tracker.body, lru_cache(16)(compared.get), TrackedPoses(draft.result.frames, poses, ~draft.lost)
+        )
 
-    def _landmarks(self, draft: _Draft, late: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    def _landmarks(self, draft: Draft, late: NDArray[np.int64]) -> NDArray[np.float64] | None:
         """Return the landmarks (F, C, L, 4) of a draft, in pixels of the cameras in use, synchronised with videos that
         are late by whole frames (C,); None if it has none."""
         found, depth = draft.current("landmarks"), draft.current("landmark_depth")
@@ -325,50 +311,48 @@ class _Finisher:
         found = np.concatenate([found, depth[..., None]], axis=-1)
         return retimed_landmarks(self.task.setup.rig.reduced_pixels(found), draft.result.frames, late)
 
-    def _track_again(
-        self, member: Member, draft: _Draft, before: Used, now: Used, late: NDArray[np.int64]
-    ) -> list[str] | None:
-        """Track a person again with refined cameras and without delays, (C,) frames, if there are delays or a camera
-        was left out of many frames. Return lines for the user; None if the first pass, which then stays, explains the
+    def _with_cameras(self, draft: Draft, rig: Rig, late: NDArray[np.int64]) -> tuple[Draft, list[str]] | None:
+        """Return a draft with other cameras, and without delays, (C,) frames, and lines for the user. The person is
+        tracked again if there are delays or a camera was left out of many frames; None if the first pass explains the
         images better.
 
         With several people, the pixels of each are known with the delays only. A source that cannot be read again is
         not tracked again.
         """
-        task, result = self.task, draft.result
-        first = Run.of(before, result.frames, draft, np.flatnonzero(result.status != Status.ABSENT))
+        task, result, (tracker, masks) = self.task, draft.result, draft.used
+        now = tracker.with_cameras(rig), retimed(masks, result.frames, late)
+        again = replace(draft.copy(), tracker=now[0], masks=now[1])
+        first = Run.of(draft.used, result.frames, draft, np.flatnonzero(result.status != Status.ABSENT))
         out = first.left_out()
         source = task.source.shifted((np.array(task.source.time_offset_s) + late / task.setup.fps).tolist())
         if source is None or source.frame_count is None or not (self.alone if late.any() else out.any()):
-            return []
+            return again, []
         _LOG.info("tracking again with the refined cameras")
         seen = self._landmarks(draft, late)
         landmarks = {} if seen is None else dict(zip(result.frames.tolist(), seen, strict=True))
         landmarks = {frame: own for frame, own in landmarks.items() if np.isfinite(own).any()}
-        done = track_again(first, now, source, task.setup, member.subject, landmarks, self.within)
+        done = track_again(first, now, source, task.setup, draft.member.subject, landmarks, self.within)
         if done is None:
             return None
         found, monitor = done
         rows = np.flatnonzero(np.isin(result.frames, list(found)))
-        again = replace(draft, lost=draft.lost.copy(), columns=dict(draft.columns))
         again.replace(rows, [found[int(frame)] for frame in result.frames[rows]])
         if not explains_better(Run.of(now, result.frames, again, rows), first):
             return None
-        draft.lost, draft.columns = again.lost, again.columns
         lines = ["tracking again: the images of the first pass were not synchronised"] if late.any() else []
         if out.any():
             names = ", ".join(np.array(task.setup.rig.names)[out])
             lines.append(f"tracking again: with the refined cameras, {names} may be right")
             lines += [f"tracked again: {line}" for line in monitor.report() or ["no camera is left out"]]
-        return lines if self.alone else [f"person {member.number}: {line}" for line in lines]
+        return again, lines
 
-    def _judge(self, draft: _Draft, second_pass: bool) -> None:
+    def _judge(self, draft: Draft) -> None:
         """Give the frames of a draft the reasons, the status and the sigma that all frames together imply."""
         posed, residual, origin = ~draft.lost, draft.current("residual"), draft.current("evidence/origin")
         reasons = draft.current("evidence/reason")
-        if second_pass and residual is not None:  # without one, no frame depends on later ones
+        if draft.refined and residual is not None:  # without one, no frame depends on later ones
             found, begins = draft.current("evidence/found"), origin == Status.RECOVERED
-            depth = depth_known(self.cameras.rig, draft.current("joints/position"), residual)
+            depth = depth_known(self.rig, draft.current("joints/position"), residual)
             evidence = FrameEvidence(found, posed, begins, residual, depth)
             reasons = judge_frames(evidence, self.task.settings.region.false_alarm, whole=True)
         reasons = np.where(posed & draft.unclear, np.uint8(Reason.UNCLEAR), reasons)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from tk.io.results.reader import read_result
 from tk.model.cameras.bundle import TrackedPoses
 from tk.model.cameras.refinement import Refined, RefinementSettings
 from tk.model.cameras.tracker_frame import TrackerFrame
+from tk.run.delays import TrackedPerson
 from tk.run.plan import reduce_images
 from tk.run.prefetch import open_observations
 from tk.run.refinement import FEWEST, refine_rig
@@ -61,7 +63,8 @@ def refine_capture(
         for observation, _ in observations.frames(int(found.frames.min()), int(found.frames.max()) + 1):
             store.put(observation.index, observation.masks)
     poses = TrackedPoses(found.frames, world.poses_in(tracked[1]), found.has_pose)
-    done = refine_rig(tracked[0].standing("z"), world.rig, store, poses, how)
+    person = TrackedPerson(tracked[0].standing("z"), lru_cache(16)(store.get), poses)
+    done = refine_rig([person], world.rig, how)
     if done is None:
         raise CaptureError(
             f"{result}: has too few consecutive tracked frames to refine {capture.path}; {FEWEST} are needed"

@@ -1,22 +1,20 @@
-"""Refinement of cameras and time offsets by the poses of a tracked person."""
+"""Refinement of cameras and time offsets by the poses of tracked people."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.captures.mask_store import MaskStore
-from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.agreement import LATE_FRAMES, CameraAgreement, camera_agreement
-from tk.model.cameras.bundle import TrackedPoses, choose_frames
+from tk.model.cameras.bundle import choose_frames
 from tk.model.cameras.camera import Rig
+from tk.model.cameras.people_bundle import Filmed
 from tk.model.cameras.refinement import SCALES, Refined, RefinementSettings, refine_cameras
 from tk.model.masks.silhouettes import Views
-from tk.run.delays import whole_delays
-from tk.trackers.protocol import TwoPassTracker
+from tk.run.delays import TrackedPerson, whole_delays
 
 Float = NDArray[np.float64]
 
@@ -33,28 +31,25 @@ _SHIFTS = 3
 
 
 def refine_rig(
-    body: ConeBody,
+    people: Sequence[TrackedPerson],
     rig: Rig,
-    store: MaskStore,
-    tracked: TrackedPoses,
     how: RefinementSettings | None = None,
     late: NDArray[np.int64] | None = None,
 ) -> Refined | None:
-    """Refine cameras by the poses of frames whose masks are in the store; None if too few are usable.
+    """Refine cameras by the poses of people; None if too few frames are usable.
 
-    Body, cameras and poses, and the returned cameras, are in a world in which z is up. If a video is late by whole
-    frames, the refinement is repeated with its other frames until less than half a frame of delay remains.
+    The cameras, also those returned, are in the world of the poses. If a video is late by whole frames, the refinement
+    is repeated with its other frames until less than half a frame of delay remains.
     """
     how = how or RefinementSettings()
-    masks = lru_cache(16)(store.get)
     late = np.zeros(len(rig), np.int64) if late is None else late
     done: Refined | None = None
     for _ in range(_SHIFTS):
-        chosen = choose_frames(masks, Views(rig), body.skeleton, tracked, FRAMES, SCALES, True, late)
-        if len(chosen) < FEWEST:
+        chosen = _chosen(people, Views(rig), SCALES, True, late)
+        if chosen is None:
             break
         before = None if done is None else done.before_px
-        done = refine_cameras(body, rig, chosen, how)
+        done = refine_cameras(chosen, rig, how)
         done = replace(
             done,
             offset_frames=done.offset_frames + late,
@@ -67,53 +62,63 @@ def refine_rig(
     return done
 
 
-def compare_cameras(tracker: TwoPassTracker, store: MaskStore, tracked: TrackedPoses) -> CameraAgreement | None:
-    """Return how the cameras differ about the tracked person; None if too few frames are usable. Arguments as of
-    :func:`refine_if_inconsistent`."""
-    tracked = replace(tracked, poses=tracker.world.poses_in(tracked.poses))
-    masks = lru_cache(16)(store.get)
-    chosen = choose_frames(masks, tracker.views, tracker.body.skeleton, tracked, FRAMES, 1, False)
-    return camera_agreement(tracker.body, tracker.world.rig, chosen) if len(chosen) >= FEWEST else None
+def _chosen(
+    people: Sequence[TrackedPerson],
+    views: Views,
+    scales: int,
+    cleaning: bool,
+    late: NDArray[np.int64] | None = None,
+) -> list[Filmed] | None:
+    """Return frames of each person, an equal number of all if possible; None if there are too few."""
+    count = max(FRAMES // max(len(people), 1), FEWEST)
+    found: list[Filmed] = [
+        (p.body, choose_frames(p.masks, views, p.body.skeleton, p.tracked, count, scales, cleaning, late))
+        for p in people
+    ]
+    return found if sum(len(frames) for _, frames in found) >= FEWEST else None
+
+
+def compare_cameras(people: Sequence[TrackedPerson], views: Views) -> CameraAgreement | None:
+    """Return how the cameras differ about tracked people; None if too few frames are usable."""
+    chosen = _chosen(people, views, 1, False)
+    return None if chosen is None else camera_agreement(chosen, views.rig)
 
 
 @dataclass(frozen=True)
 class BetterCameras:
-    """Refined cameras of a tracked person.
+    """Refined cameras.
 
     Attributes:
-        tracker: with these cameras and the same body.
+        rig: the cameras, in the world of the poses.
         offset_frames: (C,) delay of each camera, frames.
         message: what was refined, for the user.
     """
 
-    tracker: TwoPassTracker
+    rig: Rig
     offset_frames: Float
     message: str
 
 
 def refine_if_inconsistent(
-    tracker: TwoPassTracker, agreement: CameraAgreement, store: MaskStore, tracked: TrackedPoses
+    people: Sequence[TrackedPerson], rig: Rig, agreement: CameraAgreement
 ) -> BetterCameras | None:
-    """Refine the cameras if they disagree about the tracked person; None if they agree, or refinement does not help.
+    """Refine the cameras if they disagree about tracked people; None if they agree, or refinement does not help.
 
     Args:
-        tracker: after the first pass over the frames.
+        people: after the first pass over the frames.
+        rig: the cameras, in the world of the poses.
         agreement: of :func:`compare_cameras`.
-        store: the frames' masks.
-        tracked: poses in the capture's world.
     """
-    world = tracker.world
-    tracked = replace(tracked, poses=world.poses_in(tracked.poses))
-    late = whole_delays(tracker.body, world.rig, lru_cache(16)(store.get), tracked)
+    late = whole_delays(people, rig)
     if not (late.any() or agreement.inconsistent.any() or agreement.late.any()):
         return None
-    done = refine_rig(tracker.body, world.rig, store, tracked, late=late)
+    done = refine_rig(people, rig, late=late)
     if done is None:
         return None
     before, after = float(np.mean(done.before_px)), float(np.mean(done.after_px))
     if not (late.any() or after < _WORTHWHILE * before):
         return None
-    names, worst = world.rig.names, int(np.argmax(done.turn_deg))
+    names, worst = rig.names, int(np.argmax(done.turn_deg))
     delays = [f"{name} is {n:+.2f} frames late" for name, n in zip(names, done.offset_frames, strict=True)
               if abs(n) > LATE_FRAMES]  # fmt: skip
     message = (
@@ -121,4 +126,4 @@ def refine_if_inconsistent(
         f"{after:.2f}; {', '.join([f'{names[worst]} is turned most, by {done.turn_deg[worst]:.2f}°', *delays])} "
         "(refine = false keeps them)"
     )
-    return BetterCameras(tracker.with_cameras(world.rig_out(done.rig)), done.offset_frames, message)
+    return BetterCameras(done.rig, done.offset_frames, message)

@@ -48,7 +48,7 @@ class TrackOptions:
         settings: all settings.
         method: name of the tracker.
         frames: range of frames to write, end exclusive (None: to the end of the source).
-        people: "auto": one person, the first by :func:`tk.model.people.order_people`; "all": everybody in the working
+        people: "auto": one person, the first by :func:`tk.people.find.order_people`; "all": everybody in the working
             volume, also who enters later; or the numbers of people in that order, then in that of
             entering.
         causal: stop after the first pass, in which no frame depends on later ones.

@@ -54,7 +54,7 @@ OWNER = Owner(
 
 
 def stored(value: Any, kind: Any) -> Any:
-    return decode(kind, unpack_state(pack_state(1, [1], encode(value)))[2])
+    return decode(kind, unpack_state(pack_state(1, 1, encode(value)))[2])
 
 
 def test_values_are_read_as_they_were_stored() -> None:

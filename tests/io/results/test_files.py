@@ -64,7 +64,7 @@ def missing(path: Path) -> None:
     [
         (other_software, "other software|neither"),
         (not_hdf5, "not an HDF5 file"),
-        (of_version(4), "format_version is 4.*use a newer tk"),
+        (of_version(5), "format_version is 5.*use a newer tk"),
         (truncated, "damaged"),
         (incomplete, "no /frames"),
         (missing, "no such file"),
@@ -85,7 +85,7 @@ def test_results_of_an_older_version_are_ground_truth_and_no_results(tmp_path: P
     path = tmp_path / "some.h5"
     of_version(2)(path)
     for read in (read_result, read_joints):
-        with pytest.raises(ResultError, match=r"format_version is 2.*version 3: track the capture again"):
+        with pytest.raises(ResultError, match=r"format_version is 2.*versions 3 and 4.*: track the capture again"):
             read(path)
     assert np.isfinite(read_truth(path)[0].positions).all()
 

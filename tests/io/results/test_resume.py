@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from tests.io.result_files import append, assert_complete, assert_equal_values, resume, write
-from tests.io.result_victim import META, make_frame, make_state
+from tests.io.result_victim import META, make_frame, make_run, make_state
 from tk.errors import ResultError
 from tk.io.results.layout import pack_state
 from tk.io.results.reader import read_result
@@ -154,7 +154,7 @@ def test_equal_settings_in_different_notation_can_be_resumed(path: Path) -> None
         lambda state: np.append(state, np.uint8(0)),
         lambda state: state[:0],
         lambda state: np.zeros(4, np.uint8),
-        lambda state: pack_state(4, [4, 4], {}),
+        lambda state: pack_state(4, 2, {}),
     ],
 )
 def test_damaged_state_is_refused(path: Path, change: Callable[[np.ndarray], Any]) -> None:
@@ -183,7 +183,7 @@ def test_damaged_frames_are_refused_before_the_run_goes_on(
 def test_state_is_intact_after_the_result_was_copied_and_revised(path: Path) -> None:
     state = {**make_state(3), "unknown": np.array([np.nan, -np.nan]), "none": "", "umlaut": "ä", "flag": True}
     with ResultWriter.create(path, META) as writer:
-        writer.append({0: make_frame(0)}, state)
+        writer.append(make_run(0), {0: make_frame(0)}, state)
     revise_result(path, notes=["a note"])
     writer, done = ResultWriter.resume(path, META)
     writer.close()

@@ -20,7 +20,7 @@ from tests.io.result_files import (
     write,
     write_truth,
 )
-from tests.io.result_victim import META, make_frame, make_state
+from tests.io.result_victim import META, make_frame, make_run, make_state
 from tk.errors import ResultError
 from tk.io.results.data import JointAngles, UsedCameras, Value
 from tk.io.results.reader import read_joints, read_result
@@ -49,9 +49,9 @@ def test_written_values_are_read_back(path: Path, tmp_path: Path) -> None:
         "landmark_depth": "landmark_depth",
     }  # fmt: skip
     for name, field in fields.items():
-        np.testing.assert_array_equal(getattr(result, field)[6], make_frame(6)[name], err_msg=name)
+        np.testing.assert_array_equal(getattr(result, field)[6], (make_run(6) | make_frame(6))[name], err_msg=name)
     np.testing.assert_array_equal(result.angles["hip_l"][6], make_frame(6)["angles/hip_l"])
-    np.testing.assert_array_equal(result.timing["total"][6], make_frame(6)["timing/total"])
+    np.testing.assert_array_equal(result.timing["total"][6], make_run(6)["timing/total"])
     assert list(result.angles) == ["knee_l", "hip_l"] and result.timing["optimise"][6] == 0
     assert result.sigma is not None and np.isnan(result.sigma[7]).all()
     assert result.landmarks is not None and np.isnan(result.landmarks[5]).all()
@@ -95,7 +95,7 @@ def test_layout_is_the_contract(path: Path) -> None:
     assert attributes.pop("software").startswith("tk-mocap")
     assert attributes.pop("created").endswith("+00:00")
     assert attributes == {
-        "format": "tk-result", "format_version": 3, "fps": 15.0, "units": "m", "up": "z", "capture": "walk",
+        "format": "tk-result", "format_version": 4, "fps": 15.0, "units": "m", "up": "z", "capture": "walk",
         "method": "volumetric", "seed": 7, "config": META.config_toml,
     }  # fmt: skip
     # version 3 of the superblock has a flag "open for writing" that a kill leaves set; such a file does not open
@@ -130,7 +130,7 @@ def test_arrays_may_be_reused_after_append(path: Path) -> None:
         for index in range(4):
             pose[:] = index
             mean[:] = index
-            writer.append({0: make_frame(index) | {"pose": pose}}, {"mean": mean}, flush=False)
+            writer.append(make_run(index), {0: make_frame(index) | {"pose": pose}}, {"mean": mean}, flush=False)
         pose[:] = mean[:] = -1
     np.testing.assert_array_equal(read_result(path).pose[:, 0], range(4))
     np.testing.assert_array_equal(read_result(path).state["mean"], np.full(3, 3.0))
@@ -156,7 +156,7 @@ def test_state_may_change_its_shape_and_names(path: Path) -> None:
     for count in range(1, len(states) + 1):
         with ResultWriter.create(path, META) as writer:
             for index, state in enumerate(states[:count]):
-                writer.append({0: make_frame(index)}, state)
+                writer.append(make_run(index), {0: make_frame(index)}, state)
         assert_equal_values(read_result(path).state, states[count - 1])
 
 
@@ -177,9 +177,9 @@ def test_wrong_frame_is_refused_and_earlier_frames_are_kept(path: Path, change: 
     with ResultWriter.create(path, META) as writer:
         append(writer, 0)
         with pytest.raises(ValueError, match=list(change)[-1]):
-            writer.append({0: make_frame(1) | change}, make_state(1))
+            writer.append(make_run(1), {0: make_frame(1) | change}, make_state(1))
         with pytest.raises(ValueError, match="pose is missing"):
-            writer.append({0: {name: value for name, value in make_frame(1).items() if name != "pose"}})
+            writer.append(make_run(1), {0: {name: value for name, value in make_frame(1).items() if name != "pose"}})
         append(writer, 1)
     assert assert_complete(path, 2) == 2
 
@@ -199,7 +199,8 @@ def test_undeclared_datasets_are_absent(path: Path) -> None:
     with ResultWriter.create(path, plain) as writer:
         for index in range(3):
             frame = make_frame(index) | empty
-            writer.append({0: {name: value for name, value in frame.items() if not name.startswith(optional)}})
+            person = {name: value for name, value in frame.items() if not name.startswith(optional)}
+            writer.append(make_run(index), {0: person})
     result = read_result(path)
     assert result.meta == plain and result.sigma is None and result.feet is None and result.angles == {}
     assert result.pose.shape == (3, 0) and result.joints.shape == (3, 0, 3) and result.hull is not None
@@ -210,7 +211,7 @@ def test_undeclared_datasets_are_absent(path: Path) -> None:
 def test_suspect_frames_have_a_pose_and_absent_frames_have_none(path: Path) -> None:
     with ResultWriter.create(path, META) as writer:
         for status in Status:
-            writer.append({0: make_frame(int(status)) | {"status": status}})
+            writer.append(make_run(int(status)), {0: make_frame(int(status)) | {"status": status}})
     assert read_result(path).has_pose.tolist() == [True, True, True, False, True, False]
 
 
@@ -218,7 +219,7 @@ def test_paper_pose_is_derived_from_the_names_of_the_pose(path: Path) -> None:
     skeleton = build_skeleton(BodyDimensions.from_stature(1.7))
     pose = skeleton.clip(np.linspace(-0.3, 0.3, len(skeleton.names)))
     with ResultWriter.create(path, replace(META, pose_names=skeleton.names, pose_units=skeleton.units)) as writer:
-        writer.append({0: make_frame(0) | {"pose": pose}})
+        writer.append(make_run(0), {0: make_frame(0) | {"pose": pose}})
     np.testing.assert_array_equal(read_result(path).paper_pose(), [paper_poses(skeleton, pose)])
     write(path, 1)
     with pytest.raises(ResultError, match="/pose"):

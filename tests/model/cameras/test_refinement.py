@@ -13,12 +13,14 @@ from tests.model.ring import ring_of_cameras
 from tk.errors import ConfigError
 from tk.io.captures.mask_store import MaskStore
 from tk.kernels.cones import CONE
+from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_parameters import BodyFamily, shapes_of
-from tk.model.body.cone_body import SHAPE_NUMBERS, group_of
-from tk.model.cameras.agreement import camera_agreement
+from tk.model.body.cone_body import SHAPE_NUMBERS, build_cone_body, group_of
+from tk.model.cameras.agreement import CAMERA_SEARCH, camera_agreement
 from tk.model.cameras.bundle import TrackedPoses, camera_rows, choose_frames, farthest
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import closest_to_lines
+from tk.model.cameras.people_bundle import PeopleBundle
 from tk.model.cameras.refinement import (
     MOVE_M,
     SCALES,
@@ -30,6 +32,7 @@ from tk.model.cameras.refinement import (
     world_motions,
 )
 from tk.model.masks.silhouettes import Views
+from tk.run.delays import TrackedPerson
 from tk.run.refinement import refine_rig
 
 RIG = ring_of_cameras(4, width=320, height=400)
@@ -104,7 +107,7 @@ def test_camera_with_empty_masks_is_consistent():
         masks = in_time().get(k).copy()
         masks[2] = 0
         store.put(k, masks)
-    agreement = camera_agreement(BODY, RIG, frames(store, RIG))
+    agreement = camera_agreement([(BODY, frames(store, RIG))], RIG)
     assert np.isfinite(agreement.shift_px).all() and not agreement.inconsistent.any()
 
 
@@ -182,7 +185,7 @@ def test_body_family_begins_at_the_body():
 def test_refinement_corrects_perturbed_cameras():
     # rendered contours are exact, so the prior is wide
     how = RefinementSettings(trust=5.0, offsets=False)
-    found = refine_cameras(BODY, PERTURBED, frames(in_time(), PERTURBED), how)
+    found = refine_cameras([(BODY, frames(in_time(), PERTURBED))], PERTURBED, how)
     (was_turned, was_moved), (turned, moved) = errors(PERTURBED), errors(found.rig)
     assert turned < 0.08 and turned < was_turned / 2.5, (was_turned, turned)
     assert moved < 0.006 and moved < was_moved, (was_moved, moved)
@@ -191,7 +194,7 @@ def test_refinement_corrects_perturbed_cameras():
 
 
 def test_true_cameras_hardly_move():
-    found = refine_cameras(BODY, RIG, frames(in_time(), RIG), QUICK)
+    found = refine_cameras([(BODY, frames(in_time(), RIG))], RIG, QUICK)
     assert found.turn_deg.max() < 0.05 and found.move_m.max() < 0.004
     # the gauge: the cameras have no common motion or scaling
     weight = np.tile(np.repeat([1 / np.radians(TURN_DEG), 1 / MOVE_M], 3), len(RIG))
@@ -213,30 +216,30 @@ def test_focal_lengths_are_refined():
             for c in RIG
         )
     )
-    found = refine_cameras(BODY, wide, frames(in_time(), wide), RefinementSettings(focal=True))
+    found = refine_cameras([(BODY, frames(in_time(), wide))], wide, RefinementSettings(focal=True))
     assert found.focal[2] < 0.997 and np.abs(np.delete(found.focal, 2) - 1).max() < 0.004, found.focal
 
 
 @pytest.mark.parametrize("late", [(0, 0, 1, 0), (0, 0.4, 0, 0)])
 def test_delays_of_videos_are_estimated(late):
     store = rendered(late)
-    done = refine_rig(BODY, RIG, store, tracked(), QUICK)
+    done = refine_rig([TrackedPerson(BODY, store.get, tracked())], RIG, QUICK)
     assert done is not None
     np.testing.assert_allclose(done.offset_frames, late, atol=0.12)
     assert (done.offset_sigma_frames < 0.2).all()
 
 
 def test_too_few_usable_frames_give_none():
-    assert refine_rig(BODY, RIG, in_time(), tracked(usable=slice(3, 8)), QUICK) is None
+    assert refine_rig([TrackedPerson(BODY, in_time().get, tracked(usable=slice(3, 8)))], RIG, QUICK) is None
 
 
 def test_agreement_names_the_inconsistent_and_the_late_camera():
-    fine = camera_agreement(BODY, RIG, frames(in_time(), RIG))
+    fine = camera_agreement([(BODY, frames(in_time(), RIG))], RIG)
     assert not fine.inconsistent.any() and not fine.late.any()
     one = Rig(tuple(disturbed(c, np.random.default_rng(5), 0.5, 0.0) if c.name == "c1" else c for c in RIG))
-    found = camera_agreement(BODY, one, frames(in_time(), one))
+    found = camera_agreement([(BODY, frames(in_time(), one))], one)
     assert found.inconsistent[1] and np.linalg.norm(found.shift_px, axis=1).argmax() == 1
-    late = camera_agreement(BODY, RIG, frames(rendered((0, 0, 0, 1)), RIG))
+    late = camera_agreement([(BODY, frames(rendered((0, 0, 0, 1)), RIG))], RIG)
     assert late.late.tolist() == [False, False, False, True]
 
 
@@ -253,7 +256,7 @@ def test_two_cameras_of_which_one_is_turned_sideways_contradict_each_other(turne
     poses = motion().copy()
     poses[:, [BODY.skeleton.names.index(f"torso_{axis}") for axis in "xyz"]] += np.array(met) - place
     seen = choose_frames(in_time().get, Views(wrong), BODY.skeleton, tracked(poses), FRAMES, SCALES, True)
-    contradiction = camera_agreement(BODY, wrong, seen).contradiction
+    contradiction = camera_agreement([(BODY, seen)], wrong).contradiction
     assert ("larger than" in contradiction) == (turned_deg != 0), contradiction
 
 
@@ -267,3 +270,23 @@ def test_chosen_frames_cover_all_positions_of_a_person_who_stands_still_for_long
     chosen = farthest(np.concatenate([standing, walking]), 5)
     assert np.count_nonzero(chosen >= 500) == 4
     assert len(farthest(standing, 5)) == 1 and len(farthest(standing[:0], 5)) == 0
+
+
+def test_cameras_are_refined_from_all_people():
+    """The equations of the cameras are the sum of those of each person, and their prior counts once."""
+    seen = frames(in_time(), PERTURBED)
+    people = [(BODY, seen[:4]), (build_cone_body(BodyDimensions.from_stature(1.6)), seen[4:])]
+    sigmas = {"turn": 0.01, "move": 0.01}
+    both, *alone = (
+        PeopleBundle(some, 0.03, PERTURBED, CAMERA_SEARCH, sigmas) for some in (people, people[:1], people[1:])
+    )
+    found, *parts = (bundle.linearise(bundle.start, 1).reduced() for bundle in (both, *alone))
+    own = both.cameras
+    prior = np.diag(np.tile(both.sigma**-2.0, len(RIG)))
+    np.testing.assert_allclose(found.gradient[own], sum(part.gradient[own] for part in parts), rtol=1e-9)
+    np.testing.assert_allclose(
+        found.hessian[own, own], sum(part.hessian[own, own] for part in parts) - prior, rtol=1e-9, atol=1e-6
+    )
+    moved = both.move(both.start, np.zeros((len(seen), 200)), np.full(both.size, 0.01))
+    assert all(turn_between(a, b) < 1e-9 for a, b in zip(moved[0].rig, moved[1].rig, strict=True))
+    assert [len(state.poses) for state in moved] == [4, len(seen) - 4]

@@ -183,7 +183,8 @@ class Result:
     """The result of one person: F frames, D degrees of freedom, J joints, T optimiser stages.
 
     A dataset that the file does not have is None; without angles, ``angles`` is an empty mapping. For a file with
-    several people, :func:`~tk.io.results.reader.read_result` returns person 0, and ``people`` are all.
+    several people, :func:`~tk.io.results.reader.read_result` returns person 0, and ``people`` are all; they have the
+    same frames.
     """
 
     path: Path
@@ -326,28 +327,8 @@ class Result:
         meta = replace(self.meta, joint_names=JOINTS)
         return replace(self, meta=meta, joints=joints, sigma=sigma, deviation=deviation)
 
-    def aligned(self) -> tuple[Result, ...]:
-        """Return the results of all people with a row for each frame of anybody; rows of absent people have the status
-        ABSENT and NaN. If people are absent, the results have no smoothed copy and no hull.
-        """
-        if not self.others and not (self.status == Status.ABSENT).any():
-            return (self,)
-        frames = np.unique(np.concatenate([person.frames for person in self.people]))
-        time = np.empty(len(frames))
-        for person in self.people:
-            time[np.searchsorted(frames, person.frames)] = person.time
-        found = []
-        for person in self.people:
-            rows = np.full(len(frames), -1)
-            rows[np.searchsorted(frames, person.frames)] = np.where(
-                person.status == Status.ABSENT, -1, np.arange(len(person))
-            )
-            found.append(replace(person.at_rows(rows), frames=frames, time=time))
-        return tuple(found)
-
     def at_rows(self, rows: NDArray[np.int64]) -> Result:
-        """Return these rows of this person, without smoothed copy and hull; -1 gives a row with the status ABSENT, and
-        NaN in it."""
+        """Return these rows of this person, without hull; -1 gives a row with the status ABSENT, and NaN in it."""
         there = rows >= 0
 
         def take(values: NDArray[Any]) -> NDArray[Any]:
@@ -361,7 +342,8 @@ class Result:
             if values is not None:
                 columns[entry.field] = {k: take(v) for k, v in values.items()} if entry.each else take(values)
         columns["status"][~there] = Status.ABSENT
-        return replace(self, smoothed=None, hull=None, others=(), **columns)
+        smoothed = None if self.smoothed is None else {name: take(values) for name, values in self.smoothed.items()}
+        return replace(self, smoothed=smoothed, hull=None, others=(), **columns)
 
     def with_smoothed(self) -> Result:
         """Return the result with each dataset replaced by its smoothed copy, if `/smoothed` has one."""

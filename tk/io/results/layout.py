@@ -21,7 +21,8 @@ from tk.io.results.schema import (
     FORMAT,
     FORMAT_VERSION,
     HULL,
-    PERSON,
+    Column,
+    absent_row,
     columns_of,
     prefix_of,
     smoothed_columns,
@@ -36,67 +37,89 @@ Values = Mapping[str, NDArray[Any]]
 
 
 class Layout:
-    """The datasets of a result. After changes, :meth:`link_first_person` renews the links of `/people/0`.
+    """The datasets of a result.
 
     Args:
         file: the open file.
         meta: the metadata, the same for every person.
+
+    Attributes:
+        run, person: the columns of the run, and those of each person, by path.
     """
 
     def __init__(self, file: h5py.File, meta: ResultMeta) -> None:
         self.file = file
         self.meta = meta
-        self.columns = columns_of(meta)
+        columns = columns_of(meta)
+        self.run = {name: column for name, column in columns.items() if column.entry.of_run}
+        self.person = {name: column for name, column in columns.items() if not column.entry.of_run}
         self._open: dict[str, h5py.h5d.DatasetID] = {}  # opening a dataset costs more than writing a row
 
-    def put_root_attributes(self) -> None:
-        """Write the root attributes of a new result."""
+    def begin(self) -> None:
+        """Write what a new result has before its first frame: root attributes, and the empty datasets of the run."""
         values = {name: kind(getattr(self.meta, source)) for name, (source, kind) in ATTRIBUTES.items()}
         self.file.attrs.update(values | file_attributes(FORMAT, FORMAT_VERSION))
+        put_attributes(self.file.create_group("timing"), {"stages": self.meta.timing_stages})
+        self._create(self.run)
 
     def add_person(self, person: int) -> None:
-        """Create the empty datasets of a person, unless they exist. Person 0 is at the top level."""
-        prefix, chunk = prefix_of(person), max(1, round(CHUNK_SECONDS * self.meta.fps))
-        if f"{prefix}frames" in self.file:
+        """Create the datasets of a person, unless they exist; the person is absent in the frames so far."""
+        prefix, count = prefix_of(person), len(self.file["frames"])
+        if prefix in self.file:
             return
-        put_attributes(self.file.create_group(f"{prefix}timing"), {"stages": self.meta.timing_stages})
+        group = self.file.create_group(prefix)
         if self.meta.angles:
             joints = [angles.joint for angles in self.meta.angles]
-            put_attributes(self.file.create_group(f"{prefix}angles"), {"joints": joints})
-        for name, column in self.columns.items():
-            dataset = create_growing(self.file, prefix + name, column.shape, column.entry.dtype, chunk)
-            put_attributes(dataset, column.attributes)
+            put_attributes(group.create_group("angles"), {"joints": joints})
+        self._create(self.person, prefix)
+        for name, value in absent_row(self.person).items():
+            self._extend(prefix + name, np.broadcast_to(value, (count, *value.shape)))
+        self._link(person, self.person)
 
-    def append(self, person: int, rows: Sequence[Values]) -> None:
-        """Append a person's frames, of :func:`~tk.io.results.schema.checked_row`, and remove `/smoothed`, which does
-        not have them."""
-        prefix = prefix_of(person)
-        self._remove(f"{prefix}smoothed")
-        if f"{prefix}hull" in self.file or any("hull/positions" in row for row in rows):
-            self._append_hulls(prefix, rows)
-        for name in self.columns:
-            self._extend(prefix + name, np.array([row[name] for row in rows]))
+    def append(self, rows: Sequence[Values], people: Mapping[int, Sequence[Values]]) -> None:
+        """Append frames, of :func:`~tk.io.results.schema.checked_row`, and remove `/smoothed`, which does not have
+        them.
 
-    def keep_rows(self, person: int, count: int) -> None:
-        """Remove all frames of a person but the first ``count``."""
-        prefix = prefix_of(person)
-        if len(self.file[f"{prefix}frames"]) == count:
+        Args:
+            rows: of the run.
+            people: rows of every person.
+        """
+        for person, own in people.items():
+            prefix = prefix_of(person)
+            self._remove(f"{prefix}smoothed")
+            if f"{prefix}hull" in self.file or any("hull/positions" in row for row in own):
+                self._append_hulls(person, own)
+            for name in self.person:
+                self._extend(prefix + name, np.array([row[name] for row in own]))
+        for name in self.run:
+            self._extend(name, np.array([row[name] for row in rows]))
+
+    def keep(self, count: int, people: int) -> None:
+        """Remove all frames but the first ``count``, and all people but the first ``people``."""
+        for person in range(people, len(self.file["people"])):
+            self._remove(prefix_of(person))
+        if len(self.file["frames"]) == count:
             return
-        self._remove(f"{prefix}smoothed")
-        lengths = dict.fromkeys(self.columns, count)
-        if f"{prefix}hull" in self.file:
-            voxels = int(self.file[f"{prefix}hull/offsets"][count])
-            lengths |= {"hull/positions": voxels, "hull/colors": voxels, "hull/offsets": count + 1}
-        for name, length in lengths.items():
-            self.file[prefix + name].resize(length, axis=0)
+        for name in self.run:
+            self.file[name].resize(count, axis=0)
+        for prefix in map(prefix_of, range(people)):
+            self._remove(f"{prefix}smoothed")
+            lengths = dict.fromkeys(self.person, count)
+            if f"{prefix}hull" in self.file:
+                voxels = int(self.file[f"{prefix}hull/offsets"][count])
+                lengths |= {"hull/positions": voxels, "hull/colors": voxels, "hull/offsets": count + 1}
+            for name, length in lengths.items():
+                self.file[prefix + name].resize(length, axis=0)
 
     def replace(self, person: int, columns: Values, smoothed: Values) -> None:
         """Replace columns of a person, and all of `/smoothed`, which belongs to the old columns."""
-        prefix, copies = prefix_of(person), smoothed_columns(self.columns)
+        prefix, copies = prefix_of(person), smoothed_columns(self.person)
         for name, values in columns.items():
             self.file[prefix + name][...] = values
         if columns or smoothed:
             self._remove(f"{prefix}smoothed")
+        if smoothed:
+            self._link(person, ["smoothed"])
         for name, values in smoothed.items():
             put_attributes(self.file.create_dataset(f"{prefix}smoothed/{name}", data=values), copies[name].attributes)
 
@@ -107,6 +130,7 @@ class Layout:
         group = self.file.create_group(path)
         for name, value in model.items():
             group[name] = value
+        self._link(person, ["model"])
 
     def put_cameras(self, cameras: UsedCameras) -> None:
         """Write or replace `/cameras`: each dataset has one row per camera, the attribute `names` their names."""
@@ -132,24 +156,28 @@ class Layout:
         dataset.set_extent(packed.shape)
         dataset.write(h5py.h5s.ALL, h5py.h5s.ALL, packed)
 
-    def link_first_person(self) -> None:
-        """Let `/people/0`, if there are several people, hold hard links to the datasets of person 0."""
-        if "people" not in self.file:
-            return
-        group = self.file.require_group("people/0")
-        for name in PERSON:
-            if name in group and not (name in self.file and group[name] == self.file[name]):
-                del group[name]
-            if name in self.file and name not in group:
-                group[name] = self.file[name]
+    def _create(self, columns: Mapping[str, Column], prefix: str = "") -> None:
+        """Create empty datasets."""
+        chunk = max(1, round(CHUNK_SECONDS * self.meta.fps))
+        for name, column in columns.items():
+            dataset = create_growing(self.file, prefix + name, column.shape, column.entry.dtype, chunk)
+            put_attributes(dataset, column.attributes)
 
-    def _append_hulls(self, prefix: str, rows: Sequence[Values]) -> None:
+    def _link(self, person: int, names: Iterable[str]) -> None:
+        """Let the top level have links to the groups and datasets of person 0 with these paths."""
+        for name in {name.split("/")[0] for name in names} if person == 0 else ():
+            if self.file.get(name, getlink=True) is None:
+                self.file[name] = h5py.SoftLink(f"/{prefix_of(0)}{name}")
+
+    def _append_hulls(self, person: int, rows: Sequence[Values]) -> None:
+        prefix = prefix_of(person)
         if f"{prefix}hull" not in self.file:
             for entry in HULL:
                 shape, chunk = entry.lengths({"N": 0, "F+1": 0})[1:], 64 if entry is HULL[-1] else HULL_CHUNK
                 create_growing(self.file, prefix + entry.path, shape, entry.dtype, chunk)
             self.file[f"{prefix}hull/colors"].attrs["order"] = "RGB"
-            self.file[f"{prefix}hull/offsets"].resize(1 + len(self.file[f"{prefix}frames"]), axis=0)
+            self.file[f"{prefix}hull/offsets"].resize(1 + len(self.file["frames"]), axis=0)
+            self._link(person, ["hull"])
         counts = [len(row.get("hull/positions", ())) for row in rows]
         stored = self._dataset(f"{prefix}hull/positions").shape[0]
         self._extend(f"{prefix}hull/offsets", stored + np.cumsum(counts, dtype=np.int64))
@@ -207,22 +235,22 @@ def put_attributes(holder: h5py.Dataset | h5py.Group, attributes: Mapping[str, s
         holder.attrs[name] = value if isinstance(value, str) else np.array(list(value), h5py.string_dtype())
 
 
-def pack_state(frames: int, rows: Sequence[int], state: Mapping[str, Value]) -> NDArray[np.uint8]:
+def pack_state(frames: int, people: int, state: Mapping[str, Value]) -> NDArray[np.uint8]:
     """Return the content of `/resume`: a NumPy archive (npz) and its CRC-32.
 
     Args:
-        frames: number of finished frame sets.
-        rows: number of rows of each person.
-        state: state of the run after these frame sets.
+        frames: number of finished frames.
+        people: number of people in them.
+        state: state of the run after these frames.
     """
     archive = io.BytesIO()
     content: dict[str, Any] = {f"state/{name}": value for name, value in state.items()}
-    np.savez(archive, rows=frames, people=rows, **content)
+    np.savez(archive, rows=frames, people=people, **content)
     data = archive.getvalue()
     return np.frombuffer(data + zlib.crc32(data).to_bytes(4, "little"), np.uint8)
 
 
-def unpack_state(packed: NDArray[np.uint8]) -> tuple[int, list[int], dict[str, Value]]:
+def unpack_state(packed: NDArray[np.uint8]) -> tuple[int, int, dict[str, Value]]:
     """Return the arguments of :func:`pack_state`.
 
     Raises:
@@ -234,4 +262,4 @@ def unpack_state(packed: NDArray[np.uint8]) -> tuple[int, list[int], dict[str, V
     with np.load(io.BytesIO(data)) as archive:
         content = {name.removeprefix("state/"): archive[name][()] for name in archive.files}
     state = {name: str(value) if isinstance(value, str) else value for name, value in content.items()}
-    return int(state.pop("rows")), list(state.pop("people")), state
+    return int(state.pop("rows")), int(state.pop("people")), state

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +24,14 @@ from tk.io.results.schema import (
     FORMAT_VERSION,
     HULL,
     MAX_NUMBER,
+    OLDEST_VERSION,
     ROWS,
     Dataset,
     columns_of,
     prefix_of,
     smoothed_columns,
 )
+from tk.io.results.status import Status
 from tk.model.body.joints import in_joint_order
 from tk.model.cameras.camera import Camera, Rig, shortened
 
@@ -38,10 +40,12 @@ _TEXTS = {field.name for field in fields(ResultMeta) if field.type == "str"}
 
 
 def read_result(path: str | os.PathLike[str]) -> Result:
-    """Read a whole result; of a file with several people, person 0, whose ``people`` are all.
+    """Read a whole result; of a file with several people, person 0, whose ``people`` are all. They have the same
+    frames.
 
     Raises:
-        ResultError: the file does not exist, is not a result of this format version, or is incomplete or damaged.
+        ResultError: the file does not exist, is not a result of a version that can be read, or is incomplete or
+            damaged.
     """
     path = Path(path)
     with open_result(path) as (file, people):
@@ -54,8 +58,9 @@ def read_result(path: str | os.PathLike[str]) -> Result:
             "created": file.text("", "created", ""),
             "notes": file.names("", "notes") if file.attribute("", "notes") is not None else (),
         }
-        others = tuple(person.result(shared) for person in people[1:])
-        return people[0].result({**shared, "others": others})
+        found = [person.result(shared) for person in people]
+        first, *others = found if people[0].prefix else _aligned(found)
+        return replace(first, others=tuple(others))
 
 
 def read_people(path: str | os.PathLike[str]) -> tuple[JointTrack, ...]:
@@ -129,20 +134,20 @@ def as_damage_error(path: Path, what: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def open_result(path: Path) -> Iterator[tuple[Hdf5Reader, list[StoredPerson]]]:
-    """Open a result and check its format and the shapes of its datasets.
+def open_result(path: Path, to_change: bool = False) -> Iterator[tuple[Hdf5Reader, list[StoredPerson]]]:
+    """Open a result and check its format and the shapes of its datasets; ``to_change``: it will be changed.
 
     Raises:
-        ResultError: the file is not a result of the format that this version of tk writes, or it is damaged.
+        ResultError: the file is not a result, of a version that can be read or changed, or it is damaged.
     """
     with open_hdf5(path) as file:
-        _check_format(file)
-        yield file, [StoredPerson(file, number) for number in range(_count_people(file))]
+        old = _version(file, FORMAT_VERSION if to_change else OLDEST_VERSION) < FORMAT_VERSION
+        yield file, [StoredPerson(file, n, "" if old and n == 0 else prefix_of(n)) for n in range(_count_people(file))]
 
 
-def read_state(file: Hdf5Reader) -> tuple[int, list[int], dict[str, Value]] | None:
-    """Return the number of frame sets, the rows of each person and the state of the run; None if no state is stored."""
-    if "resume" not in file:
+def read_state(file: Hdf5Reader) -> tuple[int, int, dict[str, Value]] | None:
+    """Return the number of frames, the number of people and the state of the run; None if no state can be used."""
+    if "resume" not in file or file.attribute("", "format_version") != FORMAT_VERSION:
         return None
     try:
         return unpack_state(file.array("resume", "uint8", (None,)))
@@ -153,7 +158,13 @@ def read_state(file: Hdf5Reader) -> tuple[int, list[int], dict[str, Value]] | No
 class StoredPerson:
     """One person of an open result.
 
+    Args:
+        file: the result.
+        number: of the person.
+        prefix: start of the paths of the person's datasets; empty for person 0 of a file of version 3.
+
     Attributes:
+        prefix: as given.
         meta: the metadata.
         count: number of frames.
 
@@ -161,15 +172,17 @@ class StoredPerson:
         ResultError: a dataset or attribute is missing or has the wrong shape.
     """
 
-    def __init__(self, file: Hdf5Reader, number: int) -> None:
-        self._file, self._number, self._prefix = file, number, prefix_of(number)
+    def __init__(self, file: Hdf5Reader, number: int, prefix: str) -> None:
+        self._file, self._number, self.prefix = file, number, prefix
+        # in version 3 each person had the run's datasets
+        self._run = prefix if f"{prefix}frames" in file.shapes else ""
         self.meta = self._read_meta()
         self._columns = columns_of(self.meta)
-        if len(file.shapes.get(f"{self._prefix}frames", ())) != 1:
-            file.fail(f"has no /{self._prefix}frames with one number per frame; the file is damaged")
-        self.count = file.shapes[f"{self._prefix}frames"][0]
+        if len(file.shapes.get(f"{self._run}frames", ())) != 1:
+            file.fail(f"has no /{self._run}frames with one number per frame; the file is damaged")
+        self.count = file.shapes[f"{self._run}frames"][0]
         for name, column in self._columns.items():
-            expected, path = (self.count, *column.shape), self._prefix + name
+            expected, path = (self.count, *column.shape), self._path(column.entry, name)
             if file.shapes.get(path) != expected:
                 found = f"has shape {file.shapes[path]}" if path in file.shapes else "is missing"
                 file.fail(f"/{path} {found}; {expected} is expected for {self.count} frames")
@@ -177,7 +190,7 @@ class StoredPerson:
 
     def model(self) -> dict[str, Value]:
         """Return the fitted body; {} if there is none."""
-        return self._file.values(f"{self._prefix}model", MAX_NUMBER)
+        return self._file.values(f"{self.prefix}model", MAX_NUMBER)
 
     def rows(self) -> dict[str, Any]:
         """Return the values of all frames, by the field of Result, after a check of each dataset."""
@@ -188,39 +201,43 @@ class StoredPerson:
                 found[column.entry.field][column.key] = values
             else:
                 found[column.entry.field] = values
-        _check_frames(self._file, self._prefix, found["frames"])
+        _check_frames(self._file, self._run, found["frames"])
         return found
 
     def result(self, shared: dict[str, Any]) -> Result:
         """Return the whole content; ``shared`` are the fields of Result that belong to the file."""
         found, smoothed = self.rows(), None
-        if f"{self._prefix}smoothed" in self._file:
+        if f"{self.prefix}smoothed" in self._file:
             smoothed = {
                 path: self._read(f"smoothed/{path}", column.entry, *column.shape)
                 for path, column in smoothed_columns(self._columns).items()
-                if f"{self._prefix}smoothed/{path}" in self._file or path == "bridged"
+                if f"{self.prefix}smoothed/{path}" in self._file or path == "bridged"
             }
         hull = None
         if self._offsets is not None:
             voxels = int(self._offsets[-1])
-            positions, colors = (_read(self._file, self._prefix + e.path, e, (voxels, 3)) for e in HULL[:2])
+            positions, colors = (_read(self._file, self.prefix + e.path, e, (voxels, 3)) for e in HULL[:2])
             hull = Hull(positions, colors, self._offsets)
         return Result(
             meta=self.meta, person=self._number, smoothed=smoothed, model=self.model(), hull=hull, **found, **shared
         )
 
+    def _path(self, entry: Dataset, path: str) -> str:
+        return (self._run if entry.of_run else self.prefix) + path
+
     def _read(self, path: str, entry: Dataset, *shape: int) -> NDArray[Any]:
-        return _read(self._file, self._prefix + path, entry, (self.count, *shape))
+        return _read(self._file, self._path(entry, path), entry, (self.count, *shape))
 
     def _read_meta(self) -> ResultMeta:
-        file, prefix = self._file, self._prefix
+        file, prefix = self._file, self.prefix
         found: dict[str, Any] = {}
         for name, (source, kind) in ATTRIBUTES.items():
             found[source] = file.text("", name) if kind is str else kind(file.number("", name))
-        found["timing_stages"] = file.names(f"{prefix}timing", "stages") if f"{prefix}timing" in file else ()
+        timing = f"{self._run}timing"
+        found["timing_stages"] = file.names(timing, "stages") if timing in file else ()
         angles = file.names(f"{prefix}angles", "joints") if f"{prefix}angles" in file else ()
         for entry in (entry for entry in ROWS if not entry.each):
-            path = prefix + entry.path
+            path = self._path(entry, entry.path)
             exists = path in file.shapes
             if not exists and not entry.optional:
                 file.fail(f"has no /{path}; the file is damaged")
@@ -244,26 +261,51 @@ class StoredPerson:
 
     def _read_offsets(self) -> NDArray[np.int64] | None:
         """Return `/hull/offsets`, if they match the positions and colours; None without hull."""
-        if f"{self._prefix}hull" not in self._file:
+        if f"{self.prefix}hull" not in self._file:
             return None
-        offsets = _read(self._file, f"{self._prefix}hull/offsets", HULL[2], (self.count + 1,))
-        shapes = [self._file.shapes.get(self._prefix + entry.path) for entry in HULL[:2]]
+        offsets = _read(self._file, f"{self.prefix}hull/offsets", HULL[2], (self.count + 1,))
+        shapes = [self._file.shapes.get(self.prefix + entry.path) for entry in HULL[:2]]
         if offsets[0] != 0 or (np.diff(offsets) < 0).any() or shapes != [(offsets[-1], 3)] * 2:
-            self._file.fail(f"/{self._prefix}hull/offsets does not divide the voxels into frames; the file is damaged")
+            self._file.fail(f"/{self.prefix}hull/offsets does not divide the voxels into frames; the file is damaged")
         return offsets
 
 
 # --- parts of a file --------------------------------------------------------------------------------------------------
 
 
-def _check_format(file: Hdf5Reader) -> None:
+def _version(file: Hdf5Reader, oldest: int) -> int:
+    """Return the version of a result; refuse files of other software, and versions that are older or not known yet."""
     if not file.is_format(FORMAT):
         file.fail(f"an HDF5 file of other software, not a {FORMAT}; name another file")
     found = file.attribute("", "format_version")
-    if np.ndim(found) or found != FORMAT_VERSION:
+    if not isinstance(found, int | np.integer) or not oldest <= found <= FORMAT_VERSION:
         newer = isinstance(found, int | np.integer) and found > FORMAT_VERSION
         remedy = "use a newer tk" if newer else "track the capture again"
-        file.fail(f"format_version is {found}; this version of tk reads and resumes version {FORMAT_VERSION}: {remedy}")
+        file.fail(
+            f"format_version is {found}; this version of tk reads versions {OLDEST_VERSION} and {FORMAT_VERSION}, and "
+            f"continues version {FORMAT_VERSION}: {remedy}"
+        )
+    return int(found)
+
+
+def _aligned(people: Sequence[Result]) -> list[Result]:
+    """Return the people of a file of version 3 with a row for each frame of anybody, NaN where a person is absent."""
+    frames = np.unique(np.concatenate([person.frames for person in people]))
+    time = np.empty(len(frames))
+    for person in people:
+        time[np.searchsorted(frames, person.frames)] = person.time
+    found = []
+    for person in people:
+        rows = np.full(len(frames), -1)
+        there = np.where(person.status == Status.ABSENT, -1, np.arange(len(person)))
+        rows[np.searchsorted(frames, person.frames)] = there
+        if (rows < 0).any():
+            own = replace(person.at_rows(rows), frames=frames, time=time)
+            if len(person) == len(frames):
+                own = replace(own, hull=person.hull, timing=person.timing)
+            person = own
+        found.append(person)
+    return found
 
 
 def _count_people(file: Hdf5Reader) -> int:

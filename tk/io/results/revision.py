@@ -28,7 +28,7 @@ class Revision:
     """What replaces parts of a person's result; other parts stay as they are.
 
     Attributes:
-        columns: new values of datasets with one row per frame, by dataset name, for all F frames:
+        columns: new values of the person's datasets with one row per frame, by dataset name, for all F frames:
             ``{"pose": (F, D), "joints/position": (F, J, 3)}``. The result must have these datasets: a tracker that
             fills them in a second pass declares them in its :class:`ResultMeta`, and the first pass writes NaN.
             New columns delete `/smoothed`, unless ``smoothed`` is given.
@@ -63,17 +63,17 @@ def revise_people(
         ValueError: a dataset or a person is unknown, or a dataset has the wrong shape.
     """
     target = check_output(Path(path), ANY_HDF5, force=True, error=ResultError)
-    with open_result(target) as (_, people):
+    with open_result(target, to_change=True) as (_, people):
         if unknown := revisions.keys() - set(range(len(people))):
             raise ValueError(f"{path}: has no person {min(unknown)}")
-        meta, rows = people[0].meta, [person.count for person in people]
-    known = columns_of(meta)
+        meta, rows = people[0].meta, people[0].count
+    known = {name: column for name, column in columns_of(meta).items() if not column.entry.of_run}
     checked = {}
     for person, revision in revisions.items():
         if revision.smoothed is not None and "bridged" not in revision.smoothed:
             raise ValueError("/smoothed needs bridged, which is missing")
-        changed = _checked(known, revision.columns, rows[person])
-        checked[person] = changed, _checked(smoothed_columns(known), revision.smoothed or {}, rows[person])
+        changed = _checked(known, revision.columns, rows)
+        checked[person] = changed, _checked(smoothed_columns(known), revision.smoothed or {}, rows)
     with writing(target), Hdf5Writer(target, target) as disk:
         layout = Layout(disk.file, meta)
         for person, revision in revisions.items():
@@ -84,7 +84,6 @@ def revise_people(
             layout.put_cameras(cameras)
         if notes is not None:
             put_attributes(disk.file, {"notes": notes})
-        layout.link_first_person()
     return meta
 
 

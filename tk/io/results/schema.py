@@ -9,14 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tk.io.results.status import STATUS_MEANING
+from tk.io.results.status import STATUS_MEANING, Status
 from tk.model.body.joints import FOOT_POINTS
 
 if TYPE_CHECKING:
     from tk.io.results.data import ResultMeta
 
 FORMAT = "tk-result"
-FORMAT_VERSION = 3
+#: version that is written, and the oldest one that is read: in version 3 person 0 was at the top level, and the others
+#: had rows of their own
+FORMAT_VERSION, OLDEST_VERSION = 4, 3
 
 #: Largest valid values: distance from the world's origin in metres, any other number, frame index. They are far above
 #: what a capture holds; a larger value means a damaged file.
@@ -57,6 +59,7 @@ class Dataset:
     # range of valid numbers; infinity is read as NaN unless the range contains it
     valid: tuple[float, float] = (-MAX_NUMBER, MAX_NUMBER)
     finite: bool = False  # True if NaN and infinity are not valid
+    of_run: bool = False  # True if it belongs to the run, not to a person
 
     @property
     def unknown(self) -> float:
@@ -75,8 +78,8 @@ _STATUS = tuple(f"{value}: {text}" for value, text in enumerate(STATUS_MEANING))
 
 #: datasets with one row per frame
 ROWS = (
-    Dataset("frames", "F", "int64", "number of the source frame", field="frames", valid=(0, MAX_FRAME)),
-    Dataset("time", "F", "float64", "seconds", field="time", finite=True),
+    Dataset("frames", "F", "int64", "number of the source frame", field="frames", valid=(0, MAX_FRAME), of_run=True),
+    Dataset("time", "F", "float64", "seconds", field="time", finite=True, of_run=True),
     Dataset(
         "pose", "F D", "float64",
         "the pose vector, one column per degree of freedom (32 by default, 24 with `--method volumetric`)",
@@ -109,7 +112,7 @@ ROWS = (
     Dataset(
         "status", "F", "uint8",
         "0 tracked, 1 initialised, 2 recovered after loss, 3 lost, 4 suspect (tracked, but the residual contradicts "
-        "it), 5 absent (nobody in the volume); rows of lost and absent frames hold no usable pose",
+        "it), 5 absent (the person is not in the volume); lost frames hold no usable pose, absent ones hold NaN",
         {"meaning": _STATUS}, field="status", valid=(0, len(_STATUS) - 1),
     ),
     Dataset(
@@ -171,8 +174,9 @@ ROWS = (
     ),
     Dataset("iterations", "F T", "int32", "optimiser iterations by stage", {"stages": "stages"}, field="iterations"),
     Dataset(
-        "timing/<stage>", "F", "float64", "seconds by stage; `total` is the frame's share of the wall time",
-        field="timing", each="timing_stages", finite=True,
+        "timing/<stage>", "F", "float64",
+        "seconds by stage, of all people; `total` is the frame's share of the wall time",
+        field="timing", each="timing_stages", finite=True, of_run=True,
     ),
 )  # fmt: skip
 
@@ -207,7 +211,7 @@ CAMERAS = (
 SCHEMA = (*ROWS, BRIDGED, *HULL, *CAMERAS)
 
 #: datasets and groups of one person; the other parts of a file belong to all
-PERSON = (*dict.fromkeys(entry.path.split("/")[0] for entry in (*ROWS, BRIDGED, *HULL)), "model")
+PERSON = (*dict.fromkeys(e.path.split("/")[0] for e in (*ROWS, BRIDGED, *HULL) if not e.of_run), "model")
 
 
 @dataclass(frozen=True)
@@ -233,8 +237,8 @@ class Column:
 
 
 def prefix_of(person: int) -> str:
-    """Return the start of the paths of a person's datasets; person 0 is at the top level."""
-    return f"people/{person}/" if person else ""
+    """Return the start of the paths of a person's datasets."""
+    return f"people/{person}/"
 
 
 def columns_of(meta: ResultMeta) -> dict[str, Column]:
@@ -261,12 +265,18 @@ def smoothed_columns(columns: Mapping[str, Column]) -> dict[str, Column]:
     return copies | {"bridged": Column(BRIDGED, "", (), {})}
 
 
+def absent_row(columns: Mapping[str, Column]) -> dict[str, NDArray[Any]]:
+    """Return the row of a person who is absent, by path."""
+    row = {path: np.full(c.shape, c.entry.unknown, c.entry.dtype) for path, c in columns.items() if not c.entry.of_run}
+    return row | {path: np.uint8(Status.ABSENT) for path in ("status", "evidence/origin") if path in row}
+
+
 def checked_row(values: Mapping[str, ArrayLike], columns: Mapping[str, Column]) -> dict[str, NDArray[Any]]:
     """Return a copy of a frame's values by path, for all columns; :attr:`Dataset.unknown` for missing optional values.
 
     Args:
         values: values by path; with ``hull/positions`` and ``hull/colors`` (N, 3) the frame has a hull.
-        columns: the columns of the result.
+        columns: those of the run, or those of a person.
 
     Raises:
         ValueError: a shape or the status is invalid, a value is missing, or no column takes a value.
@@ -283,7 +293,7 @@ def checked_row(values: Mapping[str, ArrayLike], columns: Mapping[str, Column]) 
             row[path] = np.full(column.shape, column.entry.unknown, column.entry.dtype)
         else:
             raise ValueError(f"{path} is missing")
-    if row["status"] not in range(len(STATUS_MEANING)):
+    if "status" in row and row["status"] not in range(len(STATUS_MEANING)):
         raise ValueError(f"status {row['status']} has no meaning")
     for path, entry in hull.items():
         row[path] = Column(entry, "", (3,), {}).checked(path, values[path], len(np.asarray(values["hull/positions"])))

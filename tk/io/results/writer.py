@@ -17,7 +17,7 @@ from tk.io.results.data import ResultMeta, Value
 from tk.io.results.files import ANY_HDF5, RESULT
 from tk.io.results.layout import Layout, Values, pack_state
 from tk.io.results.reader import open_result, read_state
-from tk.io.results.schema import checked_row
+from tk.io.results.schema import absent_row, checked_row
 from tk.io.results.status import has_pose
 
 Model = Mapping[str, Value]
@@ -41,7 +41,6 @@ class ResultWriter:
         disk: Hdf5Writer,
         models: Sequence[Model],
         frames: int = 0,
-        rows: Sequence[int] = (),
         state: Mapping[str, Value] | None = None,
     ) -> None:
         self.path = path
@@ -50,11 +49,11 @@ class ResultWriter:
         self.models = list(models)
         self._disk = disk
         self._layout = Layout(disk.file, meta)
-        self._frames = frames  # frame sets, those that wait included
-        self._rows = [*rows, *(0 for _ in self.models[len(rows) :])]  # the same by person
-        self._waiting: list[dict[int, Values]] = []  # by person
+        self._absent = absent_row(self._layout.person)
+        self._frames = frames  # those that wait included
+        self._waiting: list[tuple[Values, dict[int, Values]]] = []  # of the run, and by person
         self._waiting_models: dict[int, Model] = {}
-        self._waiting_state: tuple[int, list[int], Model] | None = None
+        self._waiting_state: tuple[int, int, Model] | None = None
         self._written = False
         self._failure: ResultError | None = None
 
@@ -73,16 +72,16 @@ class ResultWriter:
         target = check_output(Path(path), RESULT, force=True, error=ResultError)
         with writing(target):
             writer = cls(target, meta, Hdf5Writer(target), [{}])
-            writer._layout.put_root_attributes()
+            writer._layout.begin()
         return writer
 
     @classmethod
     def resume(cls, path: str | os.PathLike[str], meta: ResultMeta) -> tuple[ResultWriter, int]:
-        """Continue a result after the last frame set that has a state; start a new one if there is none.
+        """Continue a result after the last frame that has a state; start a new one if there is none.
 
         Returns:
             the writer, with the stored ``state`` and the ``models`` of the file's people, and the number of finished
-            frame sets.
+            frames.
 
         Raises:
             ResultError: as in :meth:`create`, or the file was made from another capture or configuration, or its state
@@ -92,7 +91,7 @@ class ResultWriter:
         if not target.exists():
             return cls.create(path, meta), 0
         remedy = "it cannot be resumed: start again, or choose another name"
-        with open_result(target) as (file, people):
+        with open_result(target, to_change=True) as (file, people):
             for person in people:
                 try:
                     difference = person.meta.difference(meta)
@@ -103,17 +102,15 @@ class ResultWriter:
                 stored = person.rows()  # the second pass needs them
                 if not np.isfinite(stored["pose"][has_pose(stored["status"])]).all():
                     file.fail(f"/pose is NaN in a frame that has a pose; {remedy}")
-            written = [person.count for person in people]
-            frames, rows, state = read_state(file) or (written[0], written, {})
-            if len(rows) > len(written) or any(a > b for a, b in zip(rows, written, strict=False)):
+            frames, count, state = read_state(file) or (people[0].count, len(people), {})
+            if not 0 < count <= len(people) or not 0 <= frames <= people[0].count:
                 file.fail(f"the state of the run is damaged; {remedy}")
-            models = [person.model() for person in people]
+            models = [person.model() for person in people[:count]]
         with writing(target), contextlib.ExitStack() as undo:
             disk = Hdf5Writer(target, target)
             undo.callback(disk.close, publish=False)
-            writer = cls(target, meta, disk, models, frames, rows, state)
-            for number, count in enumerate(writer._rows):
-                writer._layout.keep_rows(number, count)
+            writer = cls(target, meta, disk, models, frames, state)
+            writer._layout.keep(frames, count)
             undo.pop_all()
         return writer, frames
 
@@ -133,18 +130,20 @@ class ResultWriter:
 
     def append(
         self,
+        frame: Mapping[str, ArrayLike],
         people: Mapping[int, Mapping[str, ArrayLike]],
         state: Mapping[str, Value] | None = None,
         flush: bool = True,
     ) -> None:
-        """Add a finished frame set. With ``flush``, it is in the file on return, even if the process is then killed.
+        """Add a finished frame. With ``flush``, it is in the file on return, even if the process is then killed.
 
         Args:
-            people: values of each person who is present, by the person's number: those of one row, by the paths of
-                :data:`~tk.io.results.schema.ROWS`, and optionally of the hull.
+            frame: values of the run, by the paths of :data:`~tk.io.results.schema.ROWS`.
+            people: values of each person, and optionally of the hull, by the person's number. People of the file who
+                are not in it are absent.
             state: state from which the run continues with bit-identical results: a few small arrays, numbers and
                 texts. Only the latest state is kept.
-            flush: False keeps the frame set in memory until the next call of :meth:`append`, :meth:`flush` or
+            flush: False keeps the frame in memory until the next call of :meth:`append`, :meth:`flush` or
                 :meth:`close`. It saves time: most of it is a cost per flush, not per frame.
 
         Raises:
@@ -153,17 +152,14 @@ class ResultWriter:
         """
         self._require_open()
         # copies: a tracker may reuse its arrays
-        rows: dict[int, Values] = {
-            person: checked_row(values, self._layout.columns) for person, values in people.items()
-        }
+        row = checked_row(frame, self._layout.run)
+        rows: dict[int, Values] = {n: checked_row(values, self._layout.person) for n, values in people.items()}
         self._add_people(1 + max(people, default=0))
-        self._waiting.append(rows)
+        self._waiting.append((row, rows))
         self._frames += 1
-        for person in people:
-            self._rows[person] += 1
         if state is not None:
             copy = {name: value if isinstance(value, str) else np.array(value) for name, value in state.items()}
-            self._waiting_state = (self._frames, self._rows.copy(), copy)
+            self._waiting_state = (self._frames, len(self.models), copy)
         if flush:
             self.flush()
 
@@ -214,17 +210,17 @@ class ResultWriter:
             raise ValueError(f"person {count - 1} is not the next one: the file has {len(self.models)}")
         if count > len(self.models):
             self.models.append({})
-            self._rows.append(0)
 
     def _write_waiting(self) -> None:
         """Pass bodies, frames and state on to HDF5."""
-        for person in range(len(self.models)):
+        people = range(len(self.models))
+        for person in people:
             self._layout.add_person(person)
             if person in self._waiting_models:
                 self._layout.put_model(person, self._waiting_models[person])
-            if rows := [frame_set[person] for frame_set in self._waiting if person in frame_set]:
-                self._layout.append(person, rows)
+        if self._waiting:
+            rows = {n: [present.get(n, self._absent) for _, present in self._waiting] for n in people}
+            self._layout.append([frame for frame, _ in self._waiting], rows)
         if self._waiting_state is not None:
             self._layout.put_state(pack_state(*self._waiting_state))
-        self._layout.link_first_person()
         self._waiting, self._waiting_models, self._waiting_state = [], {}, None

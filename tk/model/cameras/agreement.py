@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from tk.kernels.line_search import SearchSettings
 from tk.model.block_least_squares import gauge_projection
-from tk.model.body.body_parameters import BodyFamily
-from tk.model.body.cone_body import ConeBody
-from tk.model.cameras.bundle import SPACING_PX, BundleFrame, ContourBundle
+from tk.model.cameras.bundle import SPACING_PX
 from tk.model.cameras.camera import Rig
+from tk.model.cameras.people_bundle import Filmed, PeopleBundle
 
 Float = NDArray[np.float64]
 
@@ -89,23 +88,24 @@ class CameraAgreement:
         )
 
 
-def camera_agreement(body: ConeBody, rig: Rig, frames: Sequence[BundleFrame]) -> CameraAgreement:
-    """Measure how the cameras disagree over F frames of a tracked body, see the module.
+def camera_agreement(people: Sequence[Filmed], rig: Rig) -> CameraAgreement:
+    """Measure how the cameras disagree over frames of tracked bodies, see the module.
 
     Args:
-        body: the tracked body, in a world in which z is up.
+        people: the bodies, in a world in which z is up, with frames of
+            :func:`tk.model.cameras.bundle.choose_frames`; 20 are enough.
         rig: C cameras.
-        frames: of :func:`tk.model.cameras.bundle.choose_frames`; 20 are enough.
 
     Raises:
         ValueError: no frames.
     """
-    if not frames:
+    people = [(body, frames) for body, frames in people if frames]
+    if not people:
         raise ValueError("no frames to compare the cameras in")
     C = len(rig)
-    family = BodyFamily.around(body, SCALE_DEVIATION)
-    bundle = ContourBundle(family, rig, frames, CAMERA_SEARCH, _SIGMA_OF_TWO if C == 2 else _SIGMA)
+    bundle = PeopleBundle(people, SCALE_DEVIATION, rig, CAMERA_SEARCH, _SIGMA_OF_TWO if C == 2 else _SIGMA)
     found = bundle.linearise(bundle.start, 0).reduced()
+    body, frames = people[0]
     modes = _gauge_modes(rig, body.skeleton.joints(frames[0].pose)[0], len(bundle.sigma))
     project = gauge_projection(modes, np.tile(bundle.sigma**-2, C))
     inverse = project @ np.linalg.inv(found.hessian)[bundle.cameras]
@@ -115,7 +115,7 @@ def camera_agreement(body: ConeBody, rig: Rig, frames: Sequence[BundleFrame]) ->
     curvature = np.diag(inverse[:, bundle.cameras] @ project.T)
     spread = (scatter**2).sum(axis=0)
     deviation = np.sqrt(np.maximum(spread, curvature)).reshape(C, -1)
-    moves = any(np.abs(frame.velocity).max() > 0 for frame in frames)
+    moves = any(np.abs(frame.velocity).max() > 0 for _, frames in people for frame in frames)
     return CameraAgreement(
         names=rig.names,
         shift_px=step[:, :2],

@@ -1,10 +1,10 @@
-"""Refines cameras, their clocks, the body and its poses together on the contours of several frames.
+"""Refines cameras, their clocks, bodies and their poses together on the contours of several frames.
 
-Gauss-Newton on the equations of :mod:`tk.model.cameras.bundle`. Three gauges cannot be observed: a rigid motion of the
-world and its scale, fixed by aligning the cameras with the given ones, and the common delay of all cameras, fixed by
-calling one camera's clock right. A prior about the given calibration decides what is badly observed: if a camera is
-turned and moved so that the person stays in place in its image, only the person's depth shows it. The body's dimensions
-and shapes are unknowns, too: a body too thin for its clothes would otherwise push every camera back.
+Gauss-Newton on the equations of :mod:`tk.model.cameras.people_bundle`. Three gauges cannot be observed: a rigid motion
+of the world and its scale, fixed by aligning the cameras with the given ones, and the common delay of all cameras,
+fixed by calling one camera's clock right. A prior about the given calibration decides what is badly observed: if a
+camera is turned and moved so that the person stays in place in its image, only the person's depth shows it. The body's
+dimensions and shapes are unknowns, too: a body too thin for its clothes would otherwise push every camera back.
 """
 
 from __future__ import annotations
@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 
 from tk.errors import ConfigError
 from tk.model.block_least_squares import gauge_projection, minimise
-from tk.model.body.body_parameters import BodyFamily
-from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.agreement import CAMERA_SEARCH, SCALE_DEVIATION
-from tk.model.cameras.bundle import CAMERA_PARAMETERS, LONGEST_STEP, BundleFrame, ContourBundle, residual_px
+from tk.model.cameras.bundle import CAMERA_PARAMETERS, LONGEST_STEP, residual_px
 from tk.model.cameras.camera import Camera, Rig
+from tk.model.cameras.people_bundle import Filmed, PeopleBundle
 
 Float = NDArray[np.float64]
 
@@ -82,26 +81,21 @@ class Refined:
     frame_count: int  # number of frames used
 
 
-def refine_cameras(
-    body: ConeBody,
-    rig: Rig,
-    frames: Sequence[BundleFrame],
-    config: RefinementSettings | None = None,
-) -> Refined:
-    """Adjust C cameras to F frames; see the module.
+def refine_cameras(people: Sequence[Filmed], rig: Rig, config: RefinementSettings | None = None) -> Refined:
+    """Adjust C cameras to frames of tracked bodies; see the module.
 
     Args:
-        body: the tracked body, in a world in which z is up.
+        people: the bodies, in a world in which z is up, with frames whose pyramids have :data:`SCALES` scales.
         rig: the cameras as calibrated.
-        frames: with pyramids of :data:`SCALES` scales.
         config: see :class:`RefinementSettings`.
     """
     config = config or RefinementSettings()
     sigmas = {"turn": np.radians(TURN_DEG) * config.trust, "move": MOVE_M * config.trust}
     sigmas |= ({"focal": FOCAL} if config.focal else {}) | ({"offset": OFFSET_FRAMES} if config.offsets else {})
-    family = BodyFamily.around(body, SCALE_DEVIATION)
-    bundle = ContourBundle(family, rig, frames, CAMERA_SEARCH, sigmas)
-    C, sigma, others = len(rig), np.tile(bundle.sigma, len(rig)), np.full(len(family.start), np.inf)
+    people = [(body, frames) for body, frames in people if frames]
+    bundle = PeopleBundle(people, SCALE_DEVIATION, rig, CAMERA_SEARCH, sigmas)
+    C, sigma = len(rig), np.tile(bundle.sigma, len(rig))
+    others = np.full(bundle.size - len(sigma), np.inf)
     solution = minimise(
         bundle.start,
         bundle.linearise,
@@ -112,7 +106,7 @@ def refine_cameras(
     )
     assert solution.reduced is not None
     final, offsets = solution.state, bundle.offsets(solution.state)
-    now = aligned(final.rig, rig, sigmas["turn"], sigmas["move"])
+    now = aligned(final[0].rig, rig, sigmas["turn"], sigmas["move"])
     covariance = np.asarray(np.linalg.inv(solution.reduced.hessian), np.float64)[bundle.cameras, bundle.cameras]
     posterior, prior = _deviations(covariance, bundle), _deviations(np.diag(sigma**2), bundle)
     reference = np.argsort(offsets, kind="stable")[(C - 1) // 2]
@@ -130,7 +124,7 @@ def refine_cameras(
         before_px=residual_px(bundle.contours(bundle.start, 0), C) * rig.reductions,
         after_px=residual_px(bundle.contours(final, 0), C) * rig.reductions,
         converged=solution.converged,
-        frame_count=len(frames),
+        frame_count=sum(len(frames) for _, frames in people),
     )
 
 
@@ -191,7 +185,7 @@ def _cross(a: Float) -> Float:
     return np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
 
 
-def _deviations(covariance: Float, bundle: ContourBundle) -> dict[str, Float]:
+def _deviations(covariance: Float, bundle: PeopleBundle) -> dict[str, Float]:
     """Return (C,) standard deviations of each camera parameter, after the gauges are projected out."""
     C, k, timed = len(bundle.rig), len(bundle.sigma), "offset" in bundle.parameters
     modes = np.zeros((C, k, 7 + timed))

@@ -2,7 +2,7 @@
 
 People are found by their visual hulls, in the first frame in which somebody stands in the working volume. Everybody
 there gets a tracker, also people who are not written, because a body separates their pixels from those of others
-(:mod:`tk.trackers.sharing`). Pixels that no body explains show somebody unknown. They are no evidence for the people
+(:mod:`tk.people.share`). Pixels that no body explains show somebody unknown. They are no evidence for the people
 who are tracked. A person who enters is found in them. While somebody is awaited whom the user has chosen by number,
 everybody keeps a number while away, as if all were written.
 
@@ -23,30 +23,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ConfigError
-from tk.io.results.status import Status
 from tk.kernels.mask_values import OTHERS, PERSON
-from tk.model.body.skeleton import JOINTS
 from tk.model.cues.part_colors import RenderedBody
 from tk.model.cues.ray_costs import RayGrid
 from tk.model.masks.image_health import contradiction, sampled
-from tk.model.people import LocatedPerson, PeopleFinder, order_people
-from tk.model.setup import Subject
-from tk.run.choice import chosen, matched, unknown
-from tk.run.identity import EXCHANGED, UNCLEAR, Contact, Contacts, outcome_of
-from tk.run.member import Member, MemberState, Tracked
-from tk.run.one_person import really_there
-from tk.run.task import Task
+from tk.model.setup import Setup, Subject
+from tk.people.choose import chosen, in_order, matched, unknown
+from tk.people.find import LocatedPerson, PeopleFinder
+from tk.people.hulls import shares_by_hulls
+from tk.people.identity import EXCHANGED, UNCLEAR, Contact, Contacts, judge
+from tk.people.person import Person, PersonState, Tracked, without_pose
+from tk.people.share import PixelOwners, assign
+from tk.settings import Settings
 from tk.trackers.camera_monitor import CameraMonitor, spread_over
-from tk.trackers.protocol import Estimate, Frame, Tracker, sharing
-from tk.trackers.reason import Reason
-from tk.trackers.sharing import UNKNOWN_BY_HULLS, PixelOwners, assign, cast_points, matched_bodies
+from tk.trackers.protocol import Frame, Tracker, sharing
 
 _LOG = logging.getLogger(__name__)
 
-# A hull has people's pixels mixed up if its volume changes by this factor in the opening. With 1.5, one of two people
-# who begin beside each other (pair, frame 30) has a body of three frames; limbs of both are 4.8 and 2.1 cm off, with 2
-# 2.6 and 2.2.
-_MIXED = 2.0
 # Seconds between two searches for people who enter.
 LOOK_EVERY_S = 0.5
 # Frames of the opening in which other people are searched for if the person in the first frame cannot be tracked.
@@ -64,25 +57,6 @@ _SAME_COLORS = -1.1
 
 
 @dataclass(frozen=True)
-class PersonState:
-    """A person who is tracked.
-
-    Attributes:
-        number: see :class:`~tk.run.member.Member`.
-        subject: number of the subject; None: nothing is known of the person.
-        in_init_pose: whether the subject began in the initialisation pose.
-        body: of a person who is not in the result; None of others.
-        member: what changes from frame to frame.
-    """
-
-    number: int
-    subject: int | None
-    in_init_pose: bool
-    body: dict[str, Any] | None
-    member: MemberState
-
-
-@dataclass(frozen=True)
 class PeopleState:
     """The people who are tracked, the numbers of those who have had a tracker, and the contacts."""
 
@@ -95,17 +69,26 @@ class People:
     """Steps the trackers of a run.
 
     Args:
-        task: the scene, and who is tracked.
+        setup: the scene.
+        settings: all settings.
+        choice: who is tracked, see :class:`tk.run.task.TrackOptions`.
         first: a tracker.
         note: receives messages for the user.
     """
 
-    def __init__(self, task: Task, first: Tracker, note: Callable[[str], None]) -> None:
-        self._task, self._setup, self._choice = task, task.setup, task.options.people
+    def __init__(
+        self,
+        setup: Setup,
+        settings: Settings,
+        choice: str | tuple[int, ...],
+        first: Tracker,
+        note: Callable[[str], None],
+    ) -> None:
+        self._setup, self._settings, self._choice = setup, settings, choice
         self._first, self._note = first, note
-        self._tracked: list[Member] = []
+        self._tracked: list[Person] = []
         self._contacts = Contacts()
-        self._every = max(1, round(LOOK_EVERY_S * task.setup.fps))
+        self._every = max(1, round(LOOK_EVERY_S * setup.fps))
         self._unknown: deque[Frame] = deque(maxlen=_HISTORY)  # people who are unknown, in the last frames
         self._refused = 0  # consecutive people who could not be tracked
         self._admit_from = 0  # the frame from which on another may be
@@ -116,15 +99,13 @@ class People:
         share = sharing(first)
         self._grid: RayGrid | None = None if share is None else share.choice
 
-    def _make(self) -> Tracker:
-        """Return another tracker of the same method."""
-        return type(self._first).of(self._task.setup, self._task.settings)
-
-    def _member(self, number: int, subject: Subject, tracker: Tracker, written: bool = True) -> Member:
-        return Member(number, subject, tracker, CameraMonitor(tracker, self._setup, subject), written)
+    def _person(self, number: int, subject: Subject, written: bool = True) -> Person:
+        """Return somebody with the first tracker, whose kernels are compiled, or with another, if somebody has it."""
+        tracker = type(self._first).of(self._setup, self._settings) if self._tracked else self._first
+        return Person(number, subject, tracker, CameraMonitor(tracker, self._setup, subject), written)
 
     @property
-    def members(self) -> list[Member]:
+    def members(self) -> list[Person]:
         """The people in the result."""
         return [member for member in self._tracked if member.written]
 
@@ -143,12 +124,6 @@ class People:
     def has_segments(self) -> bool:
         """Whether segments, angles and a smoothed copy follow from the poses."""
         return self._first.has_segments
-
-    @property
-    def several(self) -> bool:
-        """Whether the result may have several people: each then has rows only for frames in which the person is
-        present."""
-        return self._choice == "all" or (self._choice != "auto" and len(self._choice) > 1)
 
     @property
     def _awaited(self) -> set[int]:
@@ -185,17 +160,15 @@ class People:
         if entered:
             self._begin_in_any_pose()
         _LOG.info("finding the person in frame %d and fitting the body to %d frames", frame.index, len(opening))
-        found = really_there(self._finder, self._setup, opening, found)
-        found = order_people(found, self._setup.volume, subjects[0].height_m, subjects[0].position)
+        found = in_order(self._finder, self._setup, opening, found)
         numbers = chosen(self._choice, found, subjects[0], self._note)
-        alone = len(found) <= 1 and 0 in numbers
-        if self._grid is None and not (alone and self._choice in ("auto", "all", (0,))):
+        if self._grid is None and (len(found) > 1 or self._choice not in ("auto", "all", (0,))):
             raise ConfigError(f"the method {self._first.method} tracks one person who is alone in view")
         try:
             compared = spread_over(opening) if given_masks else ()
             if reason := contradiction(pairwise(sampled(f.images, f.masks) for f in compared)):
                 raise CaptureError(reason)
-            self._start(opening, found, numbers, alone)
+            self._start(opening, found, numbers)
         except CaptureError as error:
             if not entered:
                 raise
@@ -217,60 +190,44 @@ class People:
         ]
         self._setup = replace(self._setup, subjects=tuple(subjects))
 
-    def _start(
-        self, opening: Sequence[Frame], found: Sequence[LocatedPerson], numbers: Sequence[int], alone: bool
+    def _start(self, opening: Sequence[Frame], found: Sequence[LocatedPerson], numbers: Sequence[int]) -> None:
+        """Start the trackers of the people found in the first frame. ``numbers``: of those chosen. A person who is
+        alone has the whole masks; if that fails, others may have entered in the opening."""
+        alone = len(found) <= 1 and 0 in numbers
+        try:
+            self._start_each(opening, found, numbers, [opening] if alone else None)
+        except CaptureError:
+            if not alone or self._grid is None or not found or not self._several_in(opening):
+                raise
+            self._start_each(opening, found, numbers, None)
+
+    def _start_each(
+        self,
+        opening: Sequence[Frame],
+        found: Sequence[LocatedPerson],
+        numbers: Sequence[int],
+        shares: Sequence[Sequence[Frame]] | None,
     ) -> None:
-        """Start the trackers of the people found in the first frame. ``numbers``: of those chosen; ``alone``: the hulls
-        show one person at most."""
-        subjects = self._setup.subjects
-        self._given = set()
-        if alone:
-            self._tracked = [self._member(0, subjects[0], self._first)]
-            try:
-                self._begin(self._tracked[0], opening, found[0].height_m if found else None)
-                self._given.add(0)
-                return
-            except CaptureError:
-                if self._grid is None or not found or not self._several_in(opening):
-                    raise
-        people = [found[n] for n in numbers]
-        known = matched(subjects[:1] if self._choice == "auto" else subjects, people, self._setup.up)
-        self._tracked = []
+        """Start a tracker for each person, with the person's share of the opening; None: by the hulls."""
+        subjects, self._tracked = self._setup.subjects, []
+        people = [found[n] for n in numbers] if found else []
+        known = matched(subjects[:1] if self._choice == "auto" else subjects, people, self._setup.up) or subjects[:1]
         rest = [n for n, person in enumerate(found) if n not in numbers and person.views.sum() >= 2]
-        shares = self._shares([*people, *(found[n] for n in rest)], opening)
-        for subject, frames, person in zip(known, shares, people, strict=False):
-            member = self._member(len(self._tracked), subject, self._new_tracker())
+        shares = shares or self._shares([*people, *(found[n] for n in rest)], opening)
+        for k, frames in enumerate(shares[: len(numbers)]):
+            member = self._person(len(self._tracked), known[k])
             try:
-                self._begin(member, frames, person.height_m, opening)
+                member.begin(frames, people[k].height_m if people else None, opening)
             except CaptureError as error:
-                if self._choice != "all" or (person is people[-1] and not self._tracked):
+                if self._choice != "all" or not (self._tracked or people[k + 1 :]):
                     raise
-                self._note(f"the person at {person.where} cannot be tracked: {error}")
+                self._note(f"the person at {people[k].where} cannot be tracked: {error}")
             else:
                 self._tracked.append(member)
-        self._given.update(numbers)
-        for n, frames in zip(rest, shares[len(people) :], strict=True):
+        self._given = set(numbers)
+        for n, frames in zip(rest, shares[len(people) :], strict=False):
             if found[n].inside and self._admit(frames, found[n], unknown(subjects[0]), written=False):
                 self._given.add(n)
-
-    def _new_tracker(self) -> Tracker:
-        """Return a tracker that nobody has: the first, whose kernels are compiled, or another."""
-        return self._make() if self._tracked else self._first
-
-    def _begin(
-        self, member: Member, frames: Sequence[Frame], hull_m: float | None, whole: Sequence[Frame] = ()
-    ) -> None:
-        """Start a tracker.
-
-        Args:
-            member: the person.
-            frames: the person's share of the opening.
-            hull_m: height of the visual hull in the first frame.
-            whole: the opening with everybody's masks.
-        """
-        seen = member.monitor.start(frames, whole)
-        member.tracker.start(seen, replace(member.subject, hull_m=hull_m))
-        member.monitor.check_body()
 
     @cached_property
     def _finder(self) -> PeopleFinder:
@@ -281,39 +238,9 @@ class People:
         return any(len(self._finder.find(f.masks, f.uncertain)) > 1 for f in spread_over(opening, _TESTED))
 
     def _shares(self, people: Sequence[LocatedPerson], frames: Sequence[Frame]) -> list[list[Frame]]:
-        """Return the observations of each person in consecutive frames, by hulls that are carved again in each.
-
-        A person's observations end where the hull grows or shrinks as no body does: there it shows a part of somebody
-        else, or somebody else has a part of this person.
-
-        Args:
-            people: in the first frame.
-            frames: their masks may have the value :data:`~tk.kernels.mask_values.OTHERS`.
-        """
-        rig, grid, finder = self._setup.rig, self._grid, self._finder
-        assert grid is not None
-        places = [person.position for person in people]
-        counts = [len(person.points) for person in people]
-        hulls = [cast_points(rig, grid, person.points, person.voxel_m) for person in people]
-        shares: list[list[Frame]] = [[] for _ in people]
-        at_first: list[int] = []  # voxels of each hull in the second frame: in the first, all masks carved it
-        mixed = [False] * len(people)
-        for frame in frames:
-            sighted = self._sighted(frame)
-            owners = assign(rig, grid, _in_place(sighted, hulls), frame, UNKNOWN_BY_HULLS)
-            if frame is not frames[0]:
-                for k, place in enumerate(places):
-                    points, places[k] = finder.around(place, owners.share(frame, k).masks, counts[k])
-                    if len(points):
-                        counts[k], hulls[k] = len(points), cast_points(rig, grid, points, finder.voxel_m)
-                at_first = at_first or list(counts)
-                owners = assign(rig, grid, _in_place(sighted, hulls), frame, UNKNOWN_BY_HULLS)
-                for k, (count, first) in enumerate(zip(counts, at_first, strict=True)):
-                    mixed[k] |= not 1 / _MIXED < count / first < _MIXED
-            for k, own in enumerate(shares):
-                if not mixed[k]:
-                    own.append(owners.share(frame, k))
-        return shares
+        """Return the observations of each person in consecutive frames, from the hulls in the first one."""
+        assert self._grid is not None
+        return shares_by_hulls(self._finder, self._grid, people, frames, self._sighted)
 
     def _sighted(self, frame: Frame) -> list[RenderedBody]:
         """Return the bodies that the landmarks in a frame show."""
@@ -325,38 +252,29 @@ class People:
     # --- one frame ----------------------------------------------------------------------------------------------------
 
     def step(self, frame: Frame) -> dict[int, Tracked]:
-        """Return the answers of the people in the result who are tracked, by number.
+        """Return the answers of the people in the result, by number.
 
-        Before that person is tracked, a result of one person has the status absent, or lost if the first person in the
-        volume could not be tracked.
+        Before anybody is tracked, person 0 is absent, or lost if the first person in the volume could not be tracked.
         """
         if not self._tracked and not self._awaited:
             return self._nobody(frame, lost=self._refused > 0)
-        owners: PixelOwners | None = None
-        if len(self._tracked) == 1 and not self._tracked[0].shows_others(frame.masks, self._setup.rig):
-            (member,) = self._tracked
-            answers = {member.number: member.step(frame)}
+        alone = len(self._tracked) == 1 and not self._tracked[0].shows_others(frame.masks, self._setup.rig)
+        owners = None if alone else self._owners(frame, ahead=True)
+        answers = {}
+        for k, one in enumerate(self._tracked):
+            share = frame if owners is None else owners.share(frame, k, one.lost and not one.absent)
+            answers[one.number] = one.step(share)
+        if owners is None:
             self._unknown.clear()
         else:
-            answers, owners = self._step_all(frame)
             without = np.empty((len(frame.masks), 0, 0, 3), np.uint8)  # images are views into the ring of frames
             self._unknown.append(replace(owners.unknown(frame), images=without))
-        self._judge(answers)
+        judge(self._contacts, self._tracked, answers)
         answers |= self._look(frame, owners)
         for member in self._tracked:
             if member.absent:
-                answer = answers[member.number]
-                answers[member.number] = replace(answer, estimate=replace(answer.estimate, origin=Status.ABSENT))
+                answers[member.number] = answers[member.number].absent(member.tracker)
         return {m.number: answers[m.number] for m in self.members} or self._nobody(frame)
-
-    def _step_all(self, frame: Frame) -> tuple[dict[int, Tracked], PixelOwners]:
-        """Return the answers of all members, and the owners of the pixels at the poses that were expected."""
-        owners = self._owners(frame, ahead=True)
-        answers = {
-            member.number: member.step(owners.share(frame, k, member.lost and not member.absent))
-            for k, member in enumerate(self._tracked)
-        }
-        return answers, owners
 
     def _owners(self, frame: Frame, ahead: bool = False) -> PixelOwners:
         """Return the owners of a frame's pixels, in the order of the members, by their bodies at the last pose, or at
@@ -364,30 +282,6 @@ class People:
         assert self._grid is not None
         bodies: list[RenderedBody | None] = [None if m.lost else m.sharing.rendered(ahead) for m in self._tracked]
         return assign(self._setup.rig, self._grid, bodies, frame)
-
-    def _judge(self, answers: Mapping[int, Tracked]) -> None:
-        """Compare people whose contact has ended with those before it; exchange their trackers if they were mixed
-        up."""
-        here = {m.number: m for m in self._tracked if not m.lost}
-        if len(self._tracked) == 1:
-            return
-        pelvis = {n: answers[n].estimate.joints[JOINTS.index("pelvis")] for n in here}
-        frame = next(iter(answers.values())).share.index
-        for contact in self._contacts.update(frame, pelvis, {n: m.sharing.learned() for n, m in here.items()}):
-            pair = [here[number] for number in contact.people]
-            likeness = np.zeros((2, 2))
-            for i, one in enumerate(pair):
-                for j, other in enumerate(pair):
-                    share, pose = answers[one.number].used, one.sharing.last_poses()[0]
-                    likeness[i, j] = other.sharing.likeness(share, contact.learned[j], pose)
-            contact.outcome = outcome_of(likeness, contact.shorter_m)
-            _LOG.debug("contact of %s, frames %d to %d: %s", contact.people, contact.first, contact.last, likeness)
-            if contact.outcome == EXCHANGED:
-                states = [member.state for member in pair]
-                for member, state, colors in zip(pair, states[::-1], contact.learned, strict=True):
-                    tracker: Any = state.tracker
-                    member.state = replace(state, tracker=replace(tracker, colors=colors))
-            contact.learned = ()
 
     # --- who enters and leaves ----------------------------------------------------------------------------------------
 
@@ -457,14 +351,14 @@ class People:
         masks = owners.unknown(frame).masks
         return [p for p in self._finder.find(masks >= PERSON, hidden=masks == OTHERS) if p.inside]
 
-    def _admit(self, frames: Sequence[Frame], person: LocatedPerson, subject: Subject, written: bool) -> Member | None:
+    def _admit(self, frames: Sequence[Frame], person: LocatedPerson, subject: Subject, written: bool) -> Person | None:
         """Add a person who is tracked from the first of some frames on; None if nobody can be tracked."""
         # people who are not written have higher numbers than all who are, now and later
         higher = len(self._choice) if isinstance(self._choice, tuple) else 1
         number = len(self.members) if written else max([higher, *(1 + m.number for m in self._tracked)])
-        member = self._member(number, subject, self._new_tracker(), written)
+        member = self._person(number, subject, written)
         try:
-            self._begin(member, frames, person.height_m)
+            member.begin(frames, person.height_m)
         except CaptureError as reason:
             self._refuse(frames[0].index, reason)
             return None
@@ -481,23 +375,7 @@ class People:
 
     def _nobody(self, frame: Frame, lost: bool = False) -> dict[int, Tracked]:
         """Return the answers in a frame before anybody in the result is tracked; ``lost``: somebody is there."""
-        absent = self._no_pose
-        lost_one = replace(absent, origin=Status.TRACKED, found=Reason.UNEXPLAINED)
-        return {} if self.several else {0: Tracked(lost_one if lost else absent, frame, frame)}
-
-    @cached_property
-    def _no_pose(self) -> Estimate:
-        tracker, views = self._first, len(self._setup.rig)
-        return Estimate(
-            pose=np.full(len(tracker.pose_names), np.nan),
-            joints=np.full((len(JOINTS), 3), np.nan),
-            origin=Status.ABSENT,
-            objective=np.nan,
-            iterations=np.zeros(len(tracker.stages), np.int32),
-            timing=dict.fromkeys(tracker.timing_stages, 0.0),
-            deviation=np.full(len(JOINTS), np.nan) if tracker.reports_sigma else None,
-            residual=np.full((views, 2), np.nan) if tracker.reports_sigma else None,
-        )
+        return {0: Tracked(without_pose(self._first, len(self._setup.rig), lost), frame, frame)}
 
     # --- what a result keeps ------------------------------------------------------------------------------------------
 
@@ -541,21 +419,11 @@ class People:
             if k is not None and subjects[k].in_init_pose and not person.in_init_pose:
                 self._begin_in_any_pose(k)
             known = Subject(in_init_pose=person.in_init_pose) if k is None else self._setup.subjects[k]
-            member = self._member(person.number, known, self._new_tracker(), written=person.body is None)
+            member = self._person(person.number, known, written=person.body is None)
             member.tracker.take_model(models[person.number] if person.body is None else person.body)
             member.state = person.member
             self._tracked.append(member)
         self._given, self._contacts.all = set(state.given), state.contacts
-
-
-def _in_place(sighted: Sequence[RenderedBody], hulls: Sequence[RenderedBody]) -> list[RenderedBody]:
-    """Return people's hulls, or in their place the bodies that landmarks show: hulls of people who stand close together
-    contain parts of each other."""
-    whose = matched_bodies([body.label > 0 for body in sighted], hulls)
-    bodies = list(hulls)
-    for n, k in whose.items():
-        bodies[k] = sighted[n]
-    return bodies
 
 
 def _not_entered(number: int) -> str:

@@ -21,13 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.mask_values import PERSON
-from tk.model.body.plausibility import EXTENT, STATURE_M
+from tk.model.body.plausibility import STATURE_M
 from tk.model.body.skeleton import up_rotation
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume, VoxelGrid
-from tk.model.hull.coarse import LEAST_LITRES, Voxels, dilated
-from tk.model.hull.voxel_table import VoxelTable, components
+from tk.model.hull.coarse import Voxels, dilated
+from tk.model.hull.voxel_table import VoxelTable
 from tk.model.masks.sightings import BEYOND_M
+from tk.people.columns import MOST, HullColumns
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -36,22 +37,6 @@ Bool = NDArray[np.bool_]
 _VOXEL_M = 0.06
 # Rows of the images that are used, approximately: a voxel has then about two pixels at 4 m.
 _ROWS = 240
-# Volume of a person's hull, litres, at most: of a man of 125 kg, whose hull may be twice as large. Components smaller
-# than a head (4 litres) are ignored.
-_MOST_LITRES, _SPECK_LITRES = 250.0, 4.0
-# A column of the floor plan is part of a trunk if so many metres of it are in the hull: an arm has 0.1 m, the trunk of
-# a crouching adult 0.6 m.
-_TRUNK_M = 0.5
-# Trunks of two people are at least so far apart, metres: the depth of a chest (0.25 m) and an error of a voxel.
-_APART_M = 0.3
-# Standard deviation of the smoothed floor plan, metres: half of a trunk's depth.
-_SMOOTH_M = 0.1
-# Radius of a person's column in a block, metres: half the breadth of the shoulders, and a step.
-_BODY_M = 0.35
-# Two columns are two people if the floor plan between them falls to this share of the lower one. Half and twice the
-# value, and those of the prices of candidates below, change the number of people in one of 40 frames of pair and of a
-# rendered embrace at most.
-_SADDLE = 0.7
 # A person costs as much as this area of unexplained pixels, sum over the views, m²: half the silhouette of an adult in
 # one view. A ghost explains less than 0.1, a person half hidden in four views explains 1.
 _LEAST_AREA_M2 = 0.3
@@ -60,8 +45,6 @@ _LEAST_AREA_M2 = 0.3
 _EXCESS_M = 0.02
 # People whose feet differ in height by less than this share a floor, metres: jumps are as high.
 _ONE_FLOOR_M = 0.3
-# Two people in one component have at least this share of the volume that they had apart: more than one of two equals.
-_TOGETHER = 0.75
 # Least pixels of a silhouette of a person whom one camera shows, in the reduced image: 20 rows of 5 pixels.
 _LEAST_PIXELS = 100
 # Such a person stands at most so far from the volume, metres: farther feet are not on the floor, but hidden.
@@ -78,8 +61,6 @@ _HEIGHT_STEP_M = 0.1
 # Half the width and half the height of the space in which one person is followed, metres; and how far this person may
 # move between frames.
 _HALF_M, _HALF_HEIGHT_M, _STEP_M = 0.9, 1.1, 0.4
-# Most candidates that are compared, by volume: all 2^12 subsets take 10 ms.
-_MOST = 12
 
 
 @dataclass(frozen=True)
@@ -147,13 +128,12 @@ class PeopleFinder:
     """
 
     def __init__(self, rig: Rig, volume: Volume, up: str) -> None:
-        self._rig, self._volume = rig, volume
+        self.rig, self._volume = rig, volume
         self._to_plan = up_rotation(up).T  # rows: two directions on the floor, and up
         self._step = max(1, round(rig.frame_shape[0] / _ROWS))
         around = _around(volume, self._to_plan[2])
         self._grid = VoxelGrid.cover(around, round(max(around.size) / _VOXEL_M))
         self._table = VoxelTable(rig, self._grid, self._step)
-        self._flat: NDArray[np.int64]  # of the voxels below
         self._voxels: Voxels  # those of the last masks
         middle = np.asarray(volume.center)
         focal = np.array([c.matrix[0, 0] * c.matrix[1, 1] for c in rig])
@@ -183,7 +163,7 @@ class PeopleFinder:
         small = self._reduced(masks)
         unsure = small if uncertain is None else small | self._reduced(uncertain)
         seen = (small, unsure, unsure if hidden is None else unsure | self._reduced(hidden))
-        known = [c for c in range(len(self._rig)) if small[c].any()]
+        known = [c for c in range(len(self.rig)) if small[c].any()]
         found = self._candidates(seen, known, near)
         chosen = self._explaining(found, small)
         missed = np.flatnonzero(self._unexplained(small, chosen)).tolist()
@@ -269,7 +249,7 @@ class PeopleFinder:
         corners = np.array([self._volume.lower, self._volume.upper])
         floor, near = float((corners @ up).min()), corners + np.array([[-_FAR_M], [_FAR_M]])
         found = []
-        for c, camera in enumerate(self._rig):
+        for c, camera in enumerate(self.rig):
             if abs(camera.rotation[2] @ up) > _STEEP:
                 continue
             count, regions, stats, _ = cv2.connectedComponentsWithStats(masks[c].astype(np.uint8))
@@ -292,7 +272,7 @@ class PeopleFinder:
                 if self._holds(position) or not ((near[0] <= feet) & (feet <= near[1])).all():
                     continue  # in the volume other cameras would show the person
                 if level @ lowest > 0 and STATURE_M[0] <= stature <= STATURE_M[1]:
-                    views = np.arange(len(self._rig)) == c
+                    views = np.arange(len(self.rig)) == c
                     share = np.where(views, 1.0, np.nan)
                     found.append(
                         LocatedPerson(position, stature, np.nan, points, self._grid.voxel_m, views, share, False)
@@ -312,130 +292,23 @@ class PeopleFinder:
     ) -> list[LocatedPerson]:
         """Return who may be in the cameras' hull; the masks in reduced images (C, h, w), with the uncertain pixels,
         and with the hidden ones, too."""
-        self._flat, self._voxels = self._table.near_hull(seen[0], seen[2], cameras)
+        flat, self._voxels = self._table.near_hull(seen[0], seen[2], cameras)
         inside, unsure, allowed = (self._voxels.inside(masks) & self._voxels.sees for masks in seen)
-        parts = self._components(inside, allowed, cameras, near)
-        return [self._person(part, inside, unsure) for part in parts]
-
-    def _components(
-        self, inside: Bool, allowed: Bool, cameras: Sequence[int], near: Sequence[LocatedPerson]
-    ) -> list[NDArray[np.int64]]:
-        """Return the voxels of each component of the cameras' hull that may be a person; wide components are split.
-
-        Args:
-            inside, allowed: (C, N) whether the mask, or the mask with its uncertain and hidden pixels, shows a voxel.
-            cameras: the cameras of the hull; each of its voxels is in two masks or more.
-            near: see :meth:`find`.
-        """
+        # each voxel of the hull is in two masks or more
         hull = (allowed[cameras] | ~self._voxels.sees[cameras]).all(axis=0) & (inside[cameras].sum(axis=0) >= 2)
-        dense = np.zeros(self._grid.count, np.bool_)
-        dense[self._flat[hull]] = True
-        label = components(dense.reshape(self._grid.shape)).reshape(-1)[self._flat]
-        order = np.argsort(label, kind="stable")
-        sizes = np.bincount(label, minlength=1)
-        wholes: list[NDArray[np.int64]] = []
-        for whole in np.split(order, np.cumsum(sizes)[:-1])[1:]:
-            if len(whole) * self._litres >= _SPECK_LITRES:
-                middle = self._trunk(whole)
-                # a gap in the masks cuts a person in two; nobody stands above somebody else
-                above = [k for k, other in enumerate(wholes) if np.linalg.norm(self._trunk(other) - middle) < _APART_M]
-                for k in reversed(above):
-                    whole = np.concatenate([wholes.pop(k), whole])
-                wholes.append(whole)
-        parts = [part for whole in wholes for part in self._split(whole, near)]
-        return [column for part in parts for column in self._columns(part) if self._plausible(column)]
+        columns = HullColumns(self._grid, self._to_plan, self._voxels.centers, flat)
+        parts = columns.people(hull, [(person.position, person.volume_m3) for person in near])
+        return [self._person(part, columns.trunk(part), inside, unsure) for part in parts]
 
-    @property
-    def _litres(self) -> float:
-        return 1000 * self._grid.voxel_m**3
-
-    def _plausible(self, part: NDArray[np.int64]) -> bool:
-        """Return whether voxels have a person's volume and extent, lying or standing."""
-        extent = float(np.ptp(self._voxels.centers[part] @ self._to_plan.T, axis=0).max()) + self._grid.voxel_m
-        litres = len(part) * self._litres
-        return litres >= LEAST_LITRES and EXTENT[0] * STATURE_M[0] <= extent <= EXTENT[1] * STATURE_M[1]
-
-    def _plan(self, part: NDArray[np.int64]) -> tuple[Float, NDArray[np.int64], Float]:
-        """Return the floor plan of voxels: metres of hull by cell, the cell (M, 2) of each voxel, and the first cell.
-
-        Cells have the voxels' edge.
-        """
-        across = self._voxels.centers[part] @ self._to_plan[:2].T
-        low = across.min(axis=0) - 3 * self._grid.voxel_m
-        cell = np.rint((across - low) / self._grid.voxel_m).astype(np.int64)
-        plan = np.zeros(cell.max(axis=0) + 4)
-        np.add.at(plan, tuple(cell.T), self._grid.voxel_m)
-        return plan, cell, low
-
-    def _split(self, part: NDArray[np.int64], near: Sequence[LocatedPerson]) -> list[NDArray[np.int64]]:
-        """Return the voxels of each person in a component: each belongs to the nearest upright column.
-
-        Columns are at the maxima of the floor plan, or at the positions of the people ``near``, see :meth:`find`.
-        """
-        plan, cell, low = self._plan(part)
-        seeds = self._maxima(plan)
-        if len(near) > len(seeds):
-            at = [self._to_plan[:2] @ person.position - low for person in near]
-            held = [np.linalg.norm(cell * self._grid.voxel_m - place, axis=1).min() < _APART_M for place in at]
-            expected = sum(person.volume_m3 for person, holds in zip(near, held, strict=True) if holds)
-            if sum(held) > len(seeds) and len(part) * self._litres >= 1000 * _TOGETHER * expected:
-                held_at = [place for place, holds in zip(at, held, strict=True) if holds]
-                seeds = np.rint(np.array(held_at) / self._grid.voxel_m).astype(np.int64)
-        if len(seeds) < 2:
-            return [part]
-        nearest = np.linalg.norm(cell[:, None] - seeds[None], axis=2).argmin(axis=1)
-        return [part[nearest == k] for k in range(len(seeds))]
-
-    def _columns(self, part: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-        """Return the voxels about each maximum of the floor plan, if one person cannot have so many; else all.
-
-        Among people who stand close together before few cameras the hull is one block. Which of its columns are people
-        is decided by the pixels that they explain.
-        """
-        if len(part) * self._litres <= _MOST_LITRES:
-            return [part]
-        plan, cell, _ = self._plan(part)
-        seeds = self._maxima(plan, 1.0, self._grid.voxel_m)
-        away = np.linalg.norm(cell[:, None] - seeds[None], axis=2) * self._grid.voxel_m
-        return [part[near] for near in (away < _BODY_M).T]
-
-    def _trunk(self, part: NDArray[np.int64]) -> Float:
-        """Return where the tallest column of voxels stands on the floor plan (2,), metres."""
-        plan, _, low = self._plan(part)
-        smooth = _blurred(plan, _SMOOTH_M / self._grid.voxel_m)
-        return np.array(np.unravel_index(smooth.argmax(), plan.shape)) * self._grid.voxel_m + low
-
-    def _maxima(self, plan: Float, saddle: float = _SADDLE, sigma_m: float = _SMOOTH_M) -> NDArray[np.int64]:
-        """Return the cells (K, 2) of the people's trunks in a floor plan smoothed by ``sigma_m``, the tallest first.
-
-        At most :data:`_MOST`. Between two of them the plan falls to the share ``saddle`` of the lower one.
-        """
-        edge = self._grid.voxel_m
-        smooth = _blurred(plan, sigma_m / edge)
-        across = 2 * max(1, round(_APART_M / edge)) + 1
-        peaks = np.argwhere((smooth == cv2.dilate(smooth, np.ones((across, across)))) & (smooth >= _TRUNK_M))
-        peaks = peaks[np.argsort(-smooth[tuple(peaks.T)], kind="stable")]
-        kept: list[NDArray[np.int64]] = []
-        for peak in peaks:
-            height = smooth[tuple(peak)]
-            steps = np.linspace(0, 1, 20)[:, None]
-            lines = [(peak + steps * (other - peak)).astype(np.float32) for other in kept]
-            between = [cv2.remap(smooth, line[:, 1], line[:, 0], cv2.INTER_LINEAR).min() for line in lines]
-            if all(lowest <= saddle * height for lowest in between):
-                kept.append(peak)
-            if len(kept) == _MOST:  # masks that are full everywhere have a maximum in every cell
-                break
-        return np.array(kept).reshape(-1, 2)
-
-    def _person(self, part: NDArray[np.int64], inside: Bool, unsure: Bool) -> LocatedPerson:
+    def _person(self, part: NDArray[np.int64], trunk: Float, inside: Bool, unsure: Bool) -> LocatedPerson:
         points, edge = self._voxels.centers[part], self._grid.voxel_m
         sees = self._voxels.sees[:, part]
         # shadows are uncertain, and add to feet and head
         certain = ~(unsure[:, part] & ~inside[:, part]).any(axis=0)
         height = points[certain if certain.any() else slice(None)] @ self._to_plan[2]
         floor, crown = float(height.min()) - edge / 2 + _EXCESS_M, float(height.max()) + edge / 2
-        position = np.array([*self._trunk(part), (floor + crown) / 2]) @ self._to_plan
-        share = np.full(len(self._rig), np.nan)
+        position = np.array([*trunk, (floor + crown) / 2]) @ self._to_plan
+        share = np.full(len(self.rig), np.nan)
         np.divide(inside[:, part].sum(axis=1), sees.sum(axis=1), out=share, where=sees.any(axis=1))
         return LocatedPerson(
             position,
@@ -460,7 +333,7 @@ class PeopleFinder:
         contradicted = ((1 - share) * covers.sum(axis=(2, 3))) @ self._pixel_m2
         price = _CONTRADICTED * contradicted + _LEAST_AREA_M2
         gain = (covers & masks).sum(axis=(2, 3)) @ self._pixel_m2 - price
-        best = np.argsort(-gain, kind="stable")[:_MOST]
+        best = np.argsort(-gain, kind="stable")[:MOST]
         best = best[gain[best] > 0]
         # pixels that the same candidates cover count together
         code = np.tensordot(1 << np.arange(len(best)), covers[best].astype(np.int64), 1)
@@ -474,24 +347,18 @@ class PeopleFinder:
 
     def _covered(self, people: Sequence[LocatedPerson]) -> Bool:
         """Return (C, h, w) the pixels of reduced images that people cover."""
-        covered = np.zeros((len(self._rig), *self._voxels.shape), np.bool_)
+        covered = np.zeros((len(self.rig), *self._voxels.shape), np.bool_)
         for person in people:
             covered |= self._silhouettes(person)
         return covered
 
     def _silhouettes(self, person: LocatedPerson) -> Bool:
         """Return (C, h, w) the silhouettes of a person in reduced images, rather too large than too small."""
-        projected = Voxels.of(self._rig, person.points, person.voxel_m, self._step)
-        images = np.zeros((len(self._rig), *projected.shape), np.uint8)
+        projected = Voxels.of(self.rig, person.points, person.voxel_m, self._step)
+        images = np.zeros((len(self.rig), *projected.shape), np.uint8)
         for image, sees, pixels in zip(images, projected.sees, projected.pixels, strict=True):
             image.ravel()[pixels[sees]] = 1
         return np.array([dilated(image, int(reach)) for image, reach in zip(images, projected.reach, strict=True)])
-
-
-def _blurred(plan: Float, sigma: float) -> Float:
-    """Return a floor plan smoothed by a Gaussian, cells."""
-    across = 2 * int(4 * sigma + 0.5) + 1
-    return np.asarray(cv2.GaussianBlur(plan, (across, across), sigma, borderType=cv2.BORDER_REFLECT))
 
 
 def _around(volume: Volume, up: Float) -> Volume:

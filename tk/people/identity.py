@@ -8,6 +8,7 @@ exchanged when the run is finished. If neither is clearly better, the frames of 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -18,9 +19,12 @@ from numpy.typing import NDArray
 from tk.io.captures.mask_store import MaskStore, MaskStores
 from tk.io.results.data import Result
 from tk.io.results.status import Status
+from tk.model.body.joints import JOINTS
 from tk.model.cues.part_colors import LearnedColors
 from tk.model.masks.image_health import described
+from tk.people.person import Person, Tracked
 
+_LOG = logging.getLogger(__name__)
 Float = NDArray[np.float64]
 
 # People are in contact if their pelvises are closer than this, metres: arms reach so far.
@@ -99,6 +103,36 @@ class Contacts:
         return ended
 
 
+def judge(contacts: Contacts, tracked: Sequence[Person], answers: Mapping[int, Tracked]) -> None:
+    """Compare people whose contact has ended with those before it; exchange their trackers if they were mixed up.
+
+    Args:
+        contacts: of the run.
+        tracked: the people.
+        answers: theirs for a frame, by number.
+    """
+    here = {person.number: person for person in tracked if not person.lost}
+    if len(tracked) == 1:
+        return
+    pelvis = {n: answers[n].estimate.joints[JOINTS.index("pelvis")] for n in here}
+    frame = next(iter(answers.values())).share.index
+    for contact in contacts.update(frame, pelvis, {n: person.sharing.learned() for n, person in here.items()}):
+        pair = [here[number] for number in contact.people]
+        likeness = np.zeros((2, 2))
+        for i, one in enumerate(pair):
+            for j, other in enumerate(pair):
+                share, pose = answers[one.number].used, one.sharing.last_poses()[0]
+                likeness[i, j] = other.sharing.likeness(share, contact.learned[j], pose)
+        contact.outcome = outcome_of(likeness, contact.shorter_m)
+        _LOG.debug("contact of %s, frames %d to %d: %s", contact.people, contact.first, contact.last, likeness)
+        if contact.outcome == EXCHANGED:
+            states = [person.state for person in pair]
+            for person, state, colors in zip(pair, states[::-1], contact.learned, strict=True):
+                tracker: Any = state.tracker
+                person.state = replace(state, tracker=replace(tracker, colors=colors))
+        contact.learned = ()
+
+
 def outcome_of(likeness: Float, shorter_m: float) -> int:
     """Return the outcome of a contact.
 
@@ -118,12 +152,11 @@ def exchanged(people: Sequence[Result], contacts: Sequence[Contact]) -> tuple[Re
     for contact in contacts:
         if contact.outcome != EXCHANGED:
             continue
-        a, b = contact.people
-        frames = np.intersect1d(found[a].frames, found[b].frames)
-        frames = frames[(frames >= contact.moment) & (frames <= contact.last)]
-        rows = {n: np.searchsorted(found[n].frames, frames) for n in (a, b)}
-        of_a, of_b = found[a], found[b]
-        found[a], found[b] = _with_rows(of_a, rows[a], of_b, rows[b]), _with_rows(of_b, rows[b], of_a, rows[a])
+        of_a, of_b = (found[n] for n in contact.people)
+        there = (of_a.status != Status.ABSENT) & (of_b.status != Status.ABSENT)
+        rows = np.flatnonzero(there & (of_a.frames >= contact.moment) & (of_a.frames <= contact.last))
+        for n, mine, other in zip(contact.people, (of_a, of_b), (of_b, of_a), strict=True):
+            found[n] = _with_rows(mine, other, rows)
     return tuple(found)
 
 
@@ -169,13 +202,14 @@ def exchanged_masks(
     return result
 
 
-def _with_rows(to: Result, rows: NDArray[np.int64], source: Result, other: NDArray[np.int64]) -> Result:
+def _with_rows(to: Result, source: Result, rows: NDArray[np.int64]) -> Result:
+    """Return a result with some rows of another one."""
     columns: dict[str, Any] = {}
     for name in COLUMNS.values():
         values = getattr(to, name)
         if values is not None:
             columns[name] = values.copy()
-            columns[name][rows] = getattr(source, name)[other]
+            columns[name][rows] = getattr(source, name)[rows]
     for name in {"status", "origin"} & columns.keys():
         columns[name][rows[columns[name][rows] == Status.INITIALISED]] = Status.TRACKED
     return replace(to, **columns)

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from tk.kernels.line_search import COLOR_BINS, MOST_LOG_RATIO
 from tk.kernels.mask_values import OTHERS, PERSON
-from tk.kernels.raycast import FAR
 from tk.model.cameras.camera import Rig
 from tk.model.cues.landmarks import LEAST_OVERLAP
 from tk.model.cues.part_colors import RenderedBody, color_bins
@@ -46,8 +45,8 @@ REACH_M = 0.5
 # around a pixel favour a person by MOST_LOG_RATIO at most (2: 3.24, 5: 3.10).
 _AVERAGED_PX = 3
 # A view shows somebody unknown if a connected region that is not near has this share of a person's area. A fast arm
-# that is not where it is expected has 0.05. Hulls expect nothing.
-UNKNOWN, UNKNOWN_BY_HULLS = 0.1, 0.03
+# that is not where it is expected has 0.05.
+UNKNOWN = 0.1
 # A network's masks of single people are further evidence: of a pixel, a person's mask is right with this probability.
 RIGHT_MASK = 0.95
 # Where somebody unknown ends is unknown, too: within this distance of the region, metres: half a trunk, and NEAR_M.
@@ -341,28 +340,3 @@ def enlarged(cells: NDArray, step: int, shape: tuple[int, ...], interpolation: i
     if below or right:
         full = cv2.copyMakeBorder(full, 0, below, 0, right, cv2.BORDER_REPLICATE)
     return np.asarray(full[:height, :width])
-
-
-def cast_points(rig: Rig, grid: RayGrid, points: Float, voxel_m: float) -> RenderedBody:
-    """Return voxels with centres (N, 3) on the grid, as a body of one part whose colours are unknown.
-
-    Args:
-        rig: the cameras, in the world of the points.
-        grid: rays of the same cameras.
-        points: metres.
-        voxel_m: edge of a voxel, metres.
-    """
-    V, h, w = grid.rays.shape[:3]
-    depth = np.full((V, h, w), FAR, np.float32)
-    for v, camera in enumerate(rig):
-        pixels, ahead = camera.project(points)
-        seen = camera.sees(points) & (ahead > 0)
-        if not seen.any():
-            continue
-        x, y = np.clip((pixels[seen] // grid.step).astype(np.int64), 0, (w - 1, h - 1)).T
-        distance = np.linalg.norm(points[seen] - camera.center, axis=1).astype(np.float32)
-        np.minimum.at(depth[v], (y, x), distance)
-        cells = voxel_m * camera.matrix[0, 0] / float(np.median(distance)) / grid.step
-        width = 2 * max(int(np.ceil(cells / 2)), 1) + 1
-        depth[v] = cv2.erode(depth[v], np.ones((width, width), np.uint8))
-    return RenderedBody((depth < FAR).astype(np.uint8), depth)

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.io.results.status import Status
 from tk.kernels.mask_values import PERSON
+from tk.model.body.joints import JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.setup import Subject
 from tk.model.stateful import Stateful
+from tk.people.share import UNKNOWN
 from tk.trackers.camera_monitor import CameraMonitor, MonitorState
 from tk.trackers.protocol import Estimate, Frame, SharingTracker, Tracker, sharing, without_cameras
+from tk.trackers.reason import Reason
 from tk.trackers.registry import TrackerState
-from tk.trackers.sharing import UNKNOWN
 
 Float = NDArray[np.float64]
 
@@ -33,10 +38,16 @@ class Tracked:
     share: Frame
     used: Frame
 
+    def absent(self, tracker: Tracker) -> Tracked:
+        """Return the answer of somebody who is absent: the reason, and what is known of the cameras, stay."""
+        names = ("found", "judged", "cameras", "shift", "timing", "iterations")
+        kept = {name: getattr(self.estimate, name) for name in names}
+        return replace(self, estimate=replace(without_pose(tracker, len(self.share.masks)), **kept))
+
 
 @dataclass(frozen=True)
-class MemberState:
-    """What changes from frame to frame, see :class:`Member`."""
+class PersonMotion:
+    """What changes from frame to frame, see :class:`Person`."""
 
     tracker: TrackerState
     monitor: MonitorState
@@ -46,11 +57,30 @@ class MemberState:
     place: Float | None
 
 
+@dataclass(frozen=True)
+class PersonState:
+    """What a resumed run needs of a person who is tracked.
+
+    Attributes:
+        number: see :class:`Person`.
+        subject: number of the subject; None: nothing is known of the person.
+        in_init_pose: whether the subject began in the initialisation pose.
+        body: of a person who is not in the result; None of others.
+        member: what changes from frame to frame.
+    """
+
+    number: int
+    subject: int | None
+    in_init_pose: bool
+    body: dict[str, Any] | None
+    member: PersonMotion
+
+
 @dataclass
-class Member(Stateful[MemberState]):
+class Person(Stateful[PersonMotion]):
     """A person who is tracked."""
 
-    State = MemberState
+    State = PersonMotion
 
     number: int  # in the result; people who are not written have higher numbers
     subject: Subject  # what is known of the person
@@ -68,6 +98,21 @@ class Member(Stateful[MemberState]):
         tracker = sharing(self.tracker)
         assert tracker is not None
         return tracker
+
+    def begin(self, frames: Sequence[Frame], hull_m: float | None, whole: Sequence[Frame] = ()) -> None:
+        """Start the tracker.
+
+        Args:
+            frames: the person's share of the opening.
+            hull_m: height of the visual hull in the first frame.
+            whole: the opening with everybody's masks.
+
+        Raises:
+            CaptureError: nobody can be tracked.
+        """
+        seen = self.monitor.start(frames, whole)
+        self.tracker.start(seen, replace(self.subject, hull_m=hull_m))
+        self.monitor.check_body()
 
     def step(self, share: Frame) -> Tracked:
         """Return the answer for this person's share of the next frame."""
@@ -106,3 +151,18 @@ class Member(Stateful[MemberState]):
         sampled = self.sharing.screen.sample(masks)
         covered = np.count_nonzero(body, axis=(1, 2))
         return bool((np.count_nonzero(body & (sampled < PERSON), axis=(1, 2)) >= 0.5 * covered).all())
+
+
+def without_pose(tracker: Tracker, views: int, lost: bool = False) -> Estimate:
+    """Return the estimate of a tracker for somebody who is absent in some views, or ``lost``."""
+    return Estimate(
+        pose=np.full(len(tracker.pose_names), np.nan),
+        joints=np.full((len(JOINTS), 3), np.nan),
+        origin=Status.TRACKED if lost else Status.ABSENT,
+        objective=np.nan,
+        iterations=np.zeros(len(tracker.stages), np.int32),
+        timing=dict.fromkeys(tracker.timing_stages, 0.0),
+        deviation=np.full(len(JOINTS), np.nan) if tracker.reports_sigma else None,
+        residual=np.full((views, 2), np.nan) if tracker.reports_sigma else None,
+        found=Reason.UNEXPLAINED if lost else Reason.NONE,
+    )
