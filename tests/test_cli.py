@@ -264,7 +264,7 @@ def test_resume_refuses_a_damaged_state(
     good = result.read_bytes()
     for name, value in [
         *own,
-        ("pose", np.zeros((2, 3))),
+        ("people/0/pose", np.zeros((2, 3))),
     ]:
         result.write_bytes(good)
         spoil(result, name, value)

@@ -49,6 +49,7 @@ class Limb:
     dofs: NDArray[np.int64]  # (L,) its degrees of freedom
     parts: NDArray[np.int32]  # (K,) its parts
     rest: NDArray[np.int32]  # (P - K,) all other parts of the body
+    still: NDArray[np.int32]  # all parts of the body that bending elbow or knee does not move
     arrays: ConeArrays  # the body for the kernels, with the contours of these parts only
     joints: list[int]  # elbow and wrist, or knee and ankle, as indices into the skeleton's joints
     grid: Float  # (N, L) candidates
@@ -89,6 +90,7 @@ def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
     result = []
     for name in LIMBS:
         parts = np.array([part.segment in CHAINS[name] for part in body.parts])
+        moved = np.array([part.segment in CHAINS[name][1:] for part in body.parts])
         dofs = np.flatnonzero(skeleton.chain_dofs(name))
         grid = _arm_grid() if name.startswith("arm") else _leg_grid(len(dofs))
         result.append(
@@ -98,6 +100,7 @@ def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
                 dofs=dofs,
                 parts=np.flatnonzero(parts).astype(np.int32),
                 rest=np.flatnonzero(~parts).astype(np.int32),
+                still=np.flatnonzero(~moved).astype(np.int32),
                 arrays=arrays._replace(curves=arrays.curves[parts[arrays.curves[:, 0]]]),
                 joints=[JOINTS.index(joint) for joint in LIMBS[name][1:]],
                 grid=np.clip(grid, skeleton.lower[dofs], skeleton.upper[dofs]),

@@ -65,9 +65,9 @@ def modes(finder: ContourFinder, seen: Seen, pose: Float, misplaced: Sequence[Li
     joints = skeleton.joints(pose)
     found = []
     for limb in finder.limbs:
-        without, rest = evidence.cast(body, pose[None], limb.rest)
-        if limb not in misplaced and without[0] - cost[0] > surplus:
-            continue  # the limb covers more than the surplus area that it could cover elsewhere
+        if limb not in misplaced and evidence.cast(body, pose[None], limb.still)[0][0] - cost[0] > surplus:
+            continue  # what is beyond elbow or knee covers more than the surplus area that it could cover elsewhere
+        _, rest = evidence.cast(body, pose[None], limb.rest)
         before = Cast(rest.label[0].copy(), rest.depth[0].copy())
         tried = limb.candidates(pose, NEARBY, rng)
         screened = evidence.score(body, tried, limb.parts, before, most_outside=OUTSIDE)
