@@ -265,6 +265,7 @@ def test_resume_refuses_a_damaged_state(
     for name, value in [
         *own,
         ("people/0/pose", np.zeros((2, 3))),
+        ("pose", np.zeros((2, 3))),
     ]:
         result.write_bytes(good)
         spoil(result, name, value)

@@ -204,9 +204,9 @@ class Result:
     created: str
     sigma: Float | None = None  # (F, J) metres, NaN for a joint without evidence
     mask_source: NDArray[np.uint8] | None = None  # (F, C), meanings in meta.mask_sources
-    # (F, C, L, 4) x, y, pixels of the recorded images, and visibility; NaN where no network was asked
+    # (F, C, L, 3) x, y, pixels of the recorded images, and visibility; NaN where no network was asked
     landmarks: NDArray[np.float32] | None = None
-    landmark_depth: NDArray[np.float32] | None = None
+    landmark_depth: NDArray[np.float32] | None = None  # (F, C, L) metres behind the middle of the hips
     reason: NDArray[np.uint8] | None = None  # (F,) why a frame is lost, suspect or without sigma, see meta.reasons
     found: NDArray[np.uint8] | None = None  # (F,) the reason that each frame itself shows, as ``reason``
     origin: NDArray[np.uint8] | None = None  # (F,) the status before the frame is judged

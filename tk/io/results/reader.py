@@ -178,6 +178,8 @@ class StoredPerson:
         self._run = prefix if f"{prefix}frames" in file.shapes else ""
         self.meta = self._read_meta()
         self._columns = columns_of(self.meta)
+        if prefix and number == 0:
+            self._refuse_copies()
         if len(file.shapes.get(f"{self._run}frames", ())) != 1:
             file.fail(f"has no /{self._run}frames with one number per frame; the file is damaged")
         self.count = file.shapes[f"{self._run}frames"][0]
@@ -187,6 +189,16 @@ class StoredPerson:
                 found = f"has shape {file.shapes[path]}" if path in file.shapes else "is missing"
                 file.fail(f"/{path} {found}; {expected} is expected for {self.count} frames")
         self._offsets = self._read_offsets()
+
+    def _refuse_copies(self) -> None:
+        """Refuse data in the place of a link to person 0: another program has changed them, and tk would not see it."""
+        own = {name.split("/")[0] for name, column in self._columns.items() if not column.entry.of_run}
+        for path in (*self._file.groups, *self._file.shapes):
+            if (name := path.split("/")[0]) in own | {"model", "smoothed", "hull"}:
+                self._file.fail(
+                    f"/{name} is not the link to /{self.prefix}{name} that tk writes; change /{self.prefix}{name}, and "
+                    f"remove /{name}"
+                )
 
     def model(self) -> dict[str, Value]:
         """Return the fitted body; {} if there is none."""

@@ -26,7 +26,7 @@ FRACTIONS = {
     "hip_half_width": 0.060,  # hip centre to the median plane
     "upper_arm": 0.160,  # de Leva; Drillis & Contini have 0.186, from the acromion
     "forearm": 0.149,
-    "hand": 0.100,  # wrist to the tip of the middle finger, relaxed; 0.108 with straight fingers
+    "hand": 0.100,  # wrist to the tip of the middle finger; Drillis & Contini have 0.108, fingers straight
     "thigh": 0.245,
     "calf": 0.246,
     "ankle_height": 0.049,  # ankle centre above the sole of a shoe; 0.039 barefoot
