@@ -184,6 +184,34 @@ def test_landmarks_of_another_shape_are_refused(names: tuple[str, ...], count: i
         masks_of(segmenter).label(shown([(0.2, 0.1)])[0])
 
 
+class Blundering(OneOfMany):
+    """Takes the feet for the whole person in a dark image, unless the square fits the person closely."""
+
+    landmarks = ("shoulder_l", "shoulder_r", "hip_l", "hip_r", "ankle_l", "ankle_r")
+
+    def segment_pose(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        found, points = self.segment(image), np.full((6, 3), np.nan)
+        y, x = np.nonzero(found > 0.5)
+        if len(x):
+            if np.median(image[image.max(axis=2) > 0]) < 80 and np.ptp(y) < 0.8 * len(image):
+                found[: y.max() - 20] = 0
+                y, x = np.nonzero(found > 0.5)
+            points[:] = x.mean(), 0, 0.9
+            points[:, 1] = y.min() + np.repeat([0.15, 0.5, 0.95], 2) * (y.max() - y.min())
+        return found, points
+
+
+def test_wrong_answers_in_two_cameras_are_asked_again_where_the_others_see_the_person() -> None:
+    """Their hull contains almost nothing."""
+    images, who = shown([(0.2, 0.1)])
+    dark = images[:2]
+    dark[who[:2] == 0] //= 2
+    labels = masks_of(Blundering(blind=2)).label(images)
+    shares = [(mask > 0)[one == 1].mean() for mask, one in zip(labels.masks, who, strict=True)]
+    assert min(shares) > 0.9, shares
+    assert np.isfinite(labels.landmarks[0, :, LANDMARKS.index("hip_l"), 0]).all()
+
+
 def test_masks_do_not_change_the_images() -> None:
     images, _ = shown([(-0.6, 0.2), (0.6, -0.1)])
     before = images.copy()

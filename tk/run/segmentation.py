@@ -206,7 +206,9 @@ def _learn_median(task: Task, note: Callable[[str], None]) -> Foreground:
     from tk.model.hull.coarse import CoarseHull  # SciPy
 
     hull = CoarseHull(setup.rig, setup.volume)
-    litres = float(np.median([hull.litres(hull.subject(each.view(np.uint8))) for each in masks]))
+    litres = float(
+        np.median([hull.litres(hull.subject(each.view(np.uint8), np.ones(len(each), np.bool_))) for each in masks])
+    )
     if litres < _LEAST_LITRES:
         raise CaptureError(
             f"{source.where}: the median cannot work: what differs from the median of {len(samples)} frames "

@@ -6,13 +6,13 @@ one person if a square shows several, and misses people whom others hide. The ca
 1. The segmenter detects people in every image. Detections are matched across the cameras, which gives the people in
    space (:mod:`tk.model.masks.sightings`). In every camera, also without a detection (from above, for example), the
    segmenter gets the square around each person.
-2. Each camera's square and mask of a person are compared with the visual hull of the person's masks in the other
-   cameras. If the square does not contain the hull or is much too large, or the mask shows somebody else, the segmenter
-   gets the square around the hull.
+2. Where a person's landmarks in a camera show somebody else than in most cameras, the segmenter gets the square around
+   the points that these cameras show. One wrong mask spoils a hull, so hulls serve only where no landmarks agree: if
+   the square does not contain the hull of the person's other masks or is much too large, or the mask shows another,
+   the segmenter gets the square around the hull. A further answer counts only if the cameras agree no less on the
+   person's landmarks.
 3. The people who are found are painted over, and the search is repeated until nobody new is found. Detections that
-   match no other camera's are people whom one camera shows. Where a person's landmarks in a camera show somebody else
-   than in most cameras, the segmenter gets the square around the points that these cameras show. A further answer of
-   the segmenter counts only if the cameras agree no less on the person's landmarks.
+   match no other camera's are people whom one camera shows.
 4. Where somebody else stands in a person's square, the segmenter gets the square again, with everybody else painted
    over.
 
@@ -141,7 +141,7 @@ class PeopleMasks:
             everybody = self._empty(self._whole)
             for c in range(len(images)):
                 self._segment(images, c, everybody)
-            self._compare(images, everybody)
+            self._compare(images, everybody, range(len(images)))
             return [everybody]
         left = images.copy()
         people: list[_Person] = []
@@ -191,42 +191,45 @@ class PeopleMasks:
         person = self._empty(self._patches(seen))
         for c in seen.cameras:
             self._segment(left, c, person)
-        self._agree(left, person)
+        self._compare(left, person, seen.cameras)
         if people and np.count_nonzero(self._new_views(person, people)) < 2:
             return None
         for c in range(len(left)):
             if c not in seen.cameras:
                 self._segment(left, c, person)
-        self._compare(left, person)
-        hull = self._hull.subject(person.masks)
+        self._compare(left, person, range(len(left)))
+        hull = self._by_all(person)
         for c in range(len(left)):
             person.masks[c] = self._hull.only(hull, c, person.masks[c])
         return person
 
-    def _agree(self, images: Images, person: _Person) -> None:
-        """Where the landmarks show somebody else than in the other cameras, give the segmenter the square around the
-        points that most cameras agree on: people who stand close together are sighted as one."""
-        known = np.isfinite(person.landmarks[..., 0]).any(axis=1)
-        agree, points, _ = consensus(self._rig, person.landmarks)
-        points = points[np.isfinite(points).all(axis=1)]
-        for c in np.flatnonzero(known & ~agree).tolist() if agree.any() else ():
-            pixels, _ = self._rig[c].project(points)
-            pixels = pixels[np.isfinite(pixels).all(axis=1)]
-            if len(pixels) > 1:
-                self._ask_again(images, c, person, Patch.about(pixels, _HULL_MARGIN, person.patches[c].angle))
-
-    def _compare(self, images: Images, person: _Person) -> None:
-        """Compare each mask with the hull of the others; where it shows somebody else, or the square fits badly, the
-        segmenter gets the square around the hull."""
-        for c, patch in enumerate(person.patches):
-            others = self._hull.subject(person.masks, but=c)
-            expected = self._hull.points(others, c)
-            if len(expected) == 0:
-                continue
-            better = Patch.about(expected, _HULL_MARGIN, patch.angle)
-            missed = self._hull.share(others, c, person.masks[c]) < _LEAST_SHARE
-            if missed or patch.side > _TOO_LARGE * better.side or not patch.holds(expected):
+    def _compare(self, images: Images, person: _Person, cameras: Sequence[int]) -> None:
+        """Where one of some cameras shows somebody else than the others, or its square fits badly, give the segmenter
+        the square around what the others show: people who stand close together are sighted as one."""
+        for c in cameras:
+            better = self._better(person, c)
+            if better is not None and better != person.patches[c]:
                 self._ask_again(images, c, person, better)
+
+    def _better(self, person: _Person, c: int) -> Patch | None:
+        """Return the square of a person in an image that follows from what the cameras show: where the landmarks of two
+        agree, from their points, else from the hull of the other cameras' masks. None if the present one is good."""
+        agree, points, _ = consensus(self._rig, person.landmarks)
+        if (seen := SeenPerson.at(points)) is not None:
+            return None if agree[c] else seen.patch(self._rig[c], _BALL_MARGIN)
+        patch, others = person.patches[c], self._hull.subject(person.masks, np.arange(len(self._rig)) != c)
+        expected = self._hull.points(others, c)
+        if not len(expected):
+            return None
+        better = Patch.about(expected, _HULL_MARGIN, patch.angle)
+        missed = self._hull.share(others, c, person.masks[c]) < _LEAST_SHARE
+        return better if missed or patch.side > _TOO_LARGE * better.side or not patch.holds(expected) else None
+
+    def _by_all(self, person: _Person) -> Bool:
+        """Return (N,) the voxels of a person's hull, by the cameras whose landmarks do not show somebody else."""
+        agree = consensus(self._rig, person.landmarks).agree
+        unknown = ~np.isfinite(person.landmarks[..., 0]).any(axis=1)
+        return self._hull.subject(person.masks, agree | unknown if agree.any() else ~agree)
 
     def _new_views(self, person: _Person, people: Sequence[_Person]) -> Bool:
         """Return (C,) whether a camera shows enough of a person that nobody else's mask shows."""
@@ -251,7 +254,8 @@ class PeopleMasks:
                 found, landmarks = self._seen(painted, c, person.patches[c])
                 if not self._take(person, c, landmarks):
                     continue
-                near = self._hull.near(self._hull.subject(person.masks, but=c), c, images.shape[1:3])
+                others = self._hull.subject(person.masks, np.arange(len(images)) != c)
+                near = self._hull.near(others, c, images.shape[1:3])
                 person.uncertain[c] |= (found > _UNCERTAIN) & near
                 person.masks[c][(found > 0.5) & near] = 255
 
@@ -275,9 +279,11 @@ class PeopleMasks:
             self._put(person, c, found)
 
     def _take(self, person: _Person, c: int, landmarks: NDArray[np.float64]) -> bool:
-        """Replace a person's landmarks in an image, unless the cameras then agree less: the network shows somebody
-        else. Return whether they were replaced."""
+        """Replace a person's landmarks in an image, unless the cameras then agree less, or there are none any more: the
+        network shows somebody else, or nobody. Return whether they were replaced."""
         before, earlier = consensus(self._rig, person.landmarks).support, person.landmarks[c].copy()
+        if np.isnan(landmarks).all() and not np.isnan(earlier).all():
+            return False
         person.landmarks[c] = landmarks
         if consensus(self._rig, person.landmarks).support < before:
             person.landmarks[c] = earlier

@@ -17,6 +17,7 @@ from tk.model.masks.sightings import Patch, Sighting, locate, volume_patch
 
 RIG = ring_of_cameras(4, 160, 200)
 VOLUME = Volume((0.0, 0.0, 1.0), (2.4, 2.4, 2.2))
+ALL = np.ones(4, np.bool_)
 
 inside = st.tuples(st.floats(-0.9, 0.9), st.floats(-0.9, 0.9))
 
@@ -136,15 +137,16 @@ def masks_of(balls) -> np.ndarray:
 def test_coarse_hull_contains_what_all_cameras_see() -> None:
     hull = CoarseHull(RIG, VOLUME)
     everyone = range(4)
-    alone = hull.subject(masks_of([(0.3, 0.2, 1.0, 0.4, everyone)]))
+    alone = hull.subject(masks_of([(0.3, 0.2, 1.0, 0.4, everyone)]), ALL)
     assert 1.0 < hull.litres(alone) / (4 / 3 * np.pi * 4.0**3) < 1.5
     beside = masks_of([(0.3, 0.2, 1.0, 0.4, everyone), (-0.9, -0.7, 1.7, 0.12, (0, 1))])
-    assert np.count_nonzero(hull.subject(beside) ^ alone) < 0.01 * np.count_nonzero(alone)
+    assert np.count_nonzero(hull.subject(beside, ALL) ^ alone) < 0.01 * np.count_nonzero(alone)
     for c in everyone:
         kept = hull.only(alone, c, beside[c])
         np.testing.assert_array_equal(kept, masks_of([(0.3, 0.2, 1.0, 0.4, everyone)])[c])
         assert hull.share(alone, c, kept) > 0.9 and hull.share(alone, c, 0 * kept) == 0
     blind = masks_of([(0.3, 0.2, 1.0, 0.4, (0, 1, 3))])
-    lenient = hull.subject(blind)
+    lenient = hull.subject(blind, ALL)
     assert hull.litres(lenient) > hull.litres(alone) and lenient[alone].all()
-    assert not hull.subject(0 * blind).any()
+    assert not hull.subject(0 * blind, ALL).any()
+    np.testing.assert_array_equal(hull.subject(blind, np.arange(4) != 2), lenient, "by the cameras that see")

@@ -70,8 +70,8 @@ def associated(rig: Rig, landmarks: Float) -> Float:
 
 
 class Consensus(NamedTuple):
-    """What most cameras show of one person: (C,) cameras that agree, the person's points (L, 3), metres, NaN if
-    unknown, and the sum of the cameras' logarithms of likelihood ratios, nats."""
+    """What most cameras show of one person: (C,) cameras that agree, the person's points (L, 3) by these cameras,
+    metres, NaN if unknown, and the sum of the cameras' logarithms of likelihood ratios, nats."""
 
     agree: NDArray[np.bool_]
     points: Float
@@ -186,7 +186,9 @@ class _Pairs(NamedTuple):
         if not (support > 0).any():
             return Consensus(np.zeros(C, np.bool_), np.full((L, 3), np.nan), 0.0)
         best = int(np.argmax(support))
-        return Consensus(fit[best] > 0, self.points[best], float(support[best]))
+        agree = fit[best] > 0
+        points = _Points.of(self.sets.of_cameras(np.flatnonzero(agree)))
+        return Consensus(agree, points.at, float(support[best]))
 
     def evidence(self) -> Float:
         """Return (C,) the logarithm of each camera's likelihood ratio by the others; NaN without another one."""

@@ -154,30 +154,27 @@ class CoarseHull:
         self._litre = 1000 * self._grid.voxel_m**3
         self._voxels = Voxels.of(rig, self._grid.centers(), self._grid.voxel_m)
 
-    def subject(self, masks: NDArray[np.uint8], but: int | None = None) -> Bool:
-        """Return (N,) the voxels of the largest object in most masks (C, H, W), 0 or more.
+    def subject(self, masks: NDArray[np.uint8], cameras: Bool) -> Bool:
+        """Return (N,) the voxels of the largest object in most masks (C, H, W), 0 or more, of some cameras (C,).
 
-        One of four or more cameras may be wrong, if the hull would be much smaller otherwise. Camera ``but`` is
-        ignored.
+        One of four or more cameras may be wrong, if the hull would be much smaller otherwise.
         """
-        strict, lenient = (self._agreed(masks, but, wrong) for wrong in (0, 1))
+        strict, lenient = (self._agreed(masks, cameras, wrong) for wrong in (0, 1))
         return strict if np.count_nonzero(strict) >= _MUCH_SMALLER * np.count_nonzero(lenient) else lenient
 
     def everybody(self, masks: NDArray[np.uint8]) -> Bool:
         """Return (N,) the voxels in all masks (C, H, W), or in all but one of four or more."""
-        return self._in_most(masks, None, 1)[0]
+        return self._in_most(masks, np.ones(len(masks), np.bool_), 1)[0]
 
-    def _in_most(self, masks: NDArray[np.uint8], but: int | None, wrong: int) -> tuple[Bool, NDArray[np.int64]]:
+    def _in_most(self, masks: NDArray[np.uint8], cameras: Bool, wrong: int) -> tuple[Bool, NDArray[np.int64]]:
         """Return (N,) the voxels that all but ``wrong`` masks contain, and in how many masks each voxel is."""
-        sees = self._voxels.sees.copy()
-        if but is not None:
-            sees[but] = False
+        sees = self._voxels.sees & cameras[:, None]
         seeing = sees.sum(axis=0)
         agreeing = (self._voxels.inside(masks) & sees).sum(axis=0)
         return (seeing >= 2) & (agreeing >= np.where(seeing >= _ENOUGH, seeing - wrong, seeing)), agreeing
 
-    def _agreed(self, masks: NDArray[np.uint8], but: int | None, wrong: int) -> Bool:
-        hull, agreeing = self._in_most(masks, but, wrong)
+    def _agreed(self, masks: NDArray[np.uint8], cameras: Bool, wrong: int) -> Bool:
+        hull, agreeing = self._in_most(masks, cameras, wrong)
         objects, count = scipy.ndimage.label(hull.reshape(self._grid.shape), np.ones((3, 3, 3)))
         if count == 0:
             return hull

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.model.body.body_points import LANDMARKS
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import closest_to_lines, sample_box
 from tk.model.cameras.volume import Volume
@@ -28,6 +29,9 @@ BEYOND_M = 2.0
 
 # A body is seen from above or below if less than this share of it is across the line of sight.
 _FORESHORTENED = 0.3
+
+# Landmarks at both ends of the trunk, each of two sides.
+_TRUNK = ("hip", "shoulder")
 
 
 @dataclass(frozen=True)
@@ -103,6 +107,17 @@ class SeenPerson:
     top: Float  # (3,) the point of the sphere above it, along the body
     radius_m: float  # metres
     cameras: tuple[int, ...]  # indices of the cameras with a sighting of the person
+
+    @staticmethod
+    def at(points: Float) -> SeenPerson | None:
+        """Return the person whose landmarks are at points (L, 3), see :data:`~tk.model.body.body_points.LANDMARKS`,
+        metres, NaN where unknown; None without hips and shoulders."""
+        hips, shoulders = (points[[LANDMARKS.index(f"{name}_{side}") for side in "lr"]].mean(axis=0) for name in _TRUNK)
+        if not np.isfinite([hips, shoulders]).all():
+            return None
+        reach = float(np.nanmax(np.linalg.norm(points - hips, axis=1)))
+        along = (shoulders - hips) / np.linalg.norm(shoulders - hips)
+        return SeenPerson(hips, hips + reach * along, reach, ())
 
     def patch(self, camera: Camera, margin: float) -> Patch | None:
         """Return the square about the sphere in an image, the body upright in it, larger by the factor ``margin``.
