@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.line_search import SearchSettings
-from tk.model.block_least_squares import minimise
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_parameters import BodyFamily
 from tk.model.body.cone_body import ConeBody
@@ -29,6 +28,7 @@ from tk.model.cameras.bundle import (
     ContourBundle,
 )
 from tk.model.masks.silhouettes import Pyramid, Views
+from tk.optim.trajectory import minimise
 
 Float = NDArray[np.float64]
 
