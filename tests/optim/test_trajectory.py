@@ -22,7 +22,8 @@ class Linear:
         rng = np.random.default_rng(seed)
         self.coupled = np.array(coupled, np.intp)
         self.before, self.after = rng.normal(size=(2, STEP_ROWS, OWN))
-        self.step_target, self.step_weight = rng.normal(size=(BLOCKS, STEP_ROWS)), rng.uniform(0.1, 2.0, STEP_ROWS)
+        self.step_target = rng.normal(size=(BLOCKS, STEP_ROWS))
+        self.step_weight = rng.uniform(0.1, 2.0, (BLOCKS, STEP_ROWS))
         self.rows = rng.normal(size=(BLOCKS, ROWS, OWN + SHARED))
         self.target, self.weight = rng.normal(size=(BLOCKS, ROWS)), rng.uniform(0.1, 2.0, (BLOCKS, ROWS))
         self.own_precision, self.shared_precision = rng.uniform(0.5, 2.0, OWN), rng.uniform(0.5, 2.0, SHARED)
@@ -39,7 +40,7 @@ class Linear:
             missing = (
                 self.step_target[self.coupled] - p[self.coupled] @ self.before.T - p[self.coupled + 1] @ self.after.T
             )
-            equations.couple(self.coupled, self.before, self.after, self.step_weight, missing)
+            equations.couple(self.coupled, self.before, self.after, self.step_weight[self.coupled], missing)
         equations.prior_hessian += np.diag(self.shared_precision)
         equations.prior_gradient -= self.shared_precision * s
         return equations
@@ -57,8 +58,8 @@ class Linear:
         for b in self.coupled.tolist():
             J = np.zeros((STEP_ROWS, len(g)))
             J[:, b * OWN : (b + 2) * OWN] = np.hstack([self.before, self.after])
-            H += J.T @ (self.step_weight[:, None] * J)
-            g += J.T @ (self.step_weight * (self.step_target[b] - J[:, : p.size] @ p.ravel()))
+            H += J.T @ (self.step_weight[b][:, None] * J)
+            g += J.T @ (self.step_weight[b] * (self.step_target[b] - J[:, : p.size] @ p.ravel()))
         return H, g
 
 
@@ -98,7 +99,8 @@ def walk(frames, seen, step=0.1):
     equations = Equations(frames, 1, 0)
     for b in seen:
         equations.add(b, [slice(0, 1)], np.eye(1), np.ones(1), np.array([float(b)]))
-    equations.couple(np.arange(frames - 1), -np.eye(1), np.eye(1), np.array([step**-2]), np.zeros((frames - 1, 1)))
+    steps = np.zeros((frames - 1, 1))
+    equations.couple(np.arange(frames - 1), -np.eye(1), np.eye(1), steps + step**-2, steps)
     return equations.reduced()
 
 

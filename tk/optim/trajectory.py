@@ -82,15 +82,15 @@ class Equations:
         Args:
             blocks: (N,) different indices of blocks, each below B - 1.
             before, after: (R, D) derivatives of R rows by the unknowns of a block and of the next one.
-            weight: (R,) information of each row.
+            weight: (N, R) information of each row.
             residual: (N, R) by how much each row's value should grow.
         """
         D = self.own
         if self.coupling is None:
             self.coupling = np.zeros((len(self.hessian) - 1, D, D))
-        self.coupling[blocks] += before.T @ (weight[:, None] * after)
+        self.coupling[blocks] += before.T @ (weight[..., None] * after)
         for index, rows in ((blocks, before), (blocks + 1, after)):
-            self.hessian[index, :D, :D] += rows.T @ (weight[:, None] * rows)
+            self.hessian[index, :D, :D] += rows.T @ (weight[..., None] * rows)
             self.gradient[index, :D] += (weight * residual) @ rows
 
     def reduced(self, damping: float = 0.0) -> Reduced:

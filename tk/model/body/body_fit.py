@@ -7,7 +7,7 @@ dimensions may change. (The silhouette paper leaves the adaptation of the body t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -48,13 +48,13 @@ class FittedBody(NamedTuple):
     Attributes:
         body: the body.
         poses: (F, D) in the frames.
-        variance: (J,) of the joints' positions along an axis, metres², that the body's uncertainty causes, mean over
-            the frames.
+        variance: computes (J,) variance of the joints' positions along an axis, metres², that the body's uncertainty
+            causes, mean over the frames.
     """
 
     body: ConeBody
     poses: Float
-    variance: Float
+    variance: Callable[[], Float]
 
 
 def fit_body(
@@ -89,7 +89,7 @@ def fit_body(
 
     stiff = bundle(None)
     state = minimise(stiff.start, stiff.linearise, stiff.move, [0] * ROUNDS, LONGEST_STEP).state
-    return FittedBody(stiff.family.build(state.body), state.poses, _joint_variance(bundle(SEGMENT_M), state))
+    return FittedBody(stiff.family.build(state.body), state.poses, lambda: _joint_variance(bundle(SEGMENT_M), state))
 
 
 def _joint_variance(bundle: ContourBundle, state: BundleState) -> Float:
