@@ -300,7 +300,7 @@ def test_frame_that_is_judged_again_has_the_sigma_of_the_first_pass() -> None:
     np.testing.assert_array_equal(both, [0.23, 0.02, np.nan])
 
 
-def test_person_who_is_tracked_again_by_other_trackers_is_judged_as_in_the_first_pass(
+def test_person_who_is_tracked_again_by_another_tracker_is_judged_as_in_the_first_pass(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rig, zeros = ring_of_cameras(4, 8, 6), np.zeros((6, 8), np.uint8)
@@ -325,7 +325,7 @@ def test_person_who_is_tracked_again_by_other_trackers_is_judged_as_in_the_first
     task: Any = SimpleNamespace(settings=Settings(), setup=SimpleNamespace(rig=rig, fps=15.0))
     finisher = finish._Finisher(task, True, print, lambda _: None, rig)
     tracker: Any = Jumping()
-    (found,) = finisher._tracked_by([tracker], draft, np.zeros((6, 4), np.bool_))
+    found = finisher._tracked_by(tracker, draft, np.zeros((6, 4), np.bool_))
     assert found.lost.tolist() == [False, False, False, True, False, False]
     assert found.columns["evidence/found"].tolist() == [0, 0, 0, Reason.JUMPS, 0, 0]
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tk.calibration.lens import Model, prior, project
 from tk.calibration.poses import Pose, cross
-from tk.model.block_least_squares import Equations, Reduced
+from tk.optim.trajectory import Equations, Reduced
 
 Float = NDArray[np.float64]
 

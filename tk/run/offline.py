@@ -27,6 +27,7 @@ from tk.run.prefetch import open_observations
 from tk.run.refinement import compare_cameras, refine_if_inconsistent
 from tk.run.second_run import Run, explains_better, track_again
 from tk.run.task import Task
+from tk.trackers.hypotheses import DROPPED
 from tk.trackers.judgement import FrameEvidence, FrameJudge, depth_known, judge_frames
 from tk.trackers.protocol import Estimate, TwoPassTracker, two_pass, without_cameras
 from tk.trackers.reason import Reason, known_sigma, report_frames, status_of
@@ -195,10 +196,11 @@ class _Finisher:
     def _with_true_heading(
         self, tracker: TwoPassTracker, masks: MaskStore, draft: Draft, height_m: float | None
     ) -> TwoPassTracker:
-        """If the opposite heading is not improbable, track the person again with both headings, each with its body;
-        keep the more probable one. Return the tracker of the heading that is kept.
+        """If the opposite heading is not improbable, by all frames, track the person again with it and its body; keep
+        the more probable one. Return the tracker of the heading that is kept.
 
         A few views of a person who stands upright at the start hardly show where the front is; a whole recording does.
+        Turned poses are worse than tracked ones. So they may refute the opposite heading, not confirm it.
         """
         rows = np.flatnonzero(~draft.lost)
         if not len(rows) or self.task.source.frame_count is None:
@@ -214,50 +216,54 @@ class _Finisher:
                 unused[rows][..., None, None], np.nan, landmarks[rows]
             )
 
+        def cost(tracker: TwoPassTracker, poses: Float, one: Draft) -> float:
+            """Return the cost of poses (F, D) after a second pass, of the frames that neither draft has lost."""
+            residual, both = one.current("residual"), np.flatnonzero(~(draft.lost | one.lost))
+            again = tracker.second_pass(
+                masks.sequence(draft.result.frames), poses, one.lost, residual, height_m, landmarks, True, self.within
+            )
+            shown, marked = seen(both)
+            return tracker.cost(shown, again[0][both], marked)
+
         shown, marked = seen(rows)
         hypotheses = tracker.headings(shown, poses[rows], height_m, marked)
         if not hypotheses:
             return tracker
-        _LOG.info("tracking with both headings: which way the person faces is unclear")
-        start = poses[np.flatnonzero(draft.result.status != Status.ABSENT)[0]]
-        for hypothesis, pose in zip(hypotheses, (start, tracker.turned_pose(start)), strict=True):
-            hypothesis.start_at(pose)
-        drafts, costs = self._tracked_by(hypotheses, draft, unused), []
-        both = np.flatnonzero(~(drafts[0].lost | drafts[1].lost))
-        shown, marked = seen(both)
-        for hypothesis, one in zip(hypotheses, drafts, strict=True):
-            first = one.current("pose"), one.lost, one.current("residual")
-            again = hypothesis.second_pass(
-                masks.sequence(draft.result.frames), *first, height_m, landmarks, True, self.within
-            )
-            costs.append(hypothesis.cost(shown, again[0][both], marked))
-        best, yaw = int(costs[1] < costs[0]), tracker.body.skeleton.index("torso_yaw")
-        if np.median(np.cos(drafts[best].current("pose")[both, yaw] - poses[both, yaw])) > 0:
-            return tracker  # either tracker may have found the other heading by itself
-        draft.lost, draft.columns = drafts[best].lost, drafts[best].columns
+        present, opposite = hypotheses
+        _LOG.info("comparing both headings: which way the person faces is unclear")
+        turned = np.array([tracker.turned_pose(pose) for pose in poses])
+        known = cost(present, poses, draft)
+        if cost(opposite, turned, draft) > known + DROPPED:
+            return tracker
+        _LOG.info("tracking with the opposite heading")
+        opposite.start_at(turned[np.flatnonzero(draft.result.status != Status.ABSENT)[0]])
+        again, yaw = self._tracked_by(opposite, draft, unused), tracker.body.skeleton.index("torso_yaw")
+        found, both = again.current("pose"), ~(draft.lost | again.lost)
+        if cost(opposite, found, again) >= known or np.median(np.cos(found[both, yaw] - poses[both, yaw])) > 0:
+            return tracker  # or it may have found the other heading by itself
+        draft.lost, draft.columns = again.lost, again.columns
         self.note("the person faces the other way than the first frames seemed to show: tracked again")
-        return hypotheses[best]
+        return opposite
 
-    def _tracked_by(self, trackers: Sequence[TwoPassTracker], draft: Draft, unused: NDArray[np.bool_]) -> list[Draft]:
-        """Track the frames of a draft by trackers that have been started, side by side, without the cameras (F, C) that
-        are unused; return a draft of each."""
+    def _tracked_by(self, tracker: TwoPassTracker, draft: Draft, unused: NDArray[np.bool_]) -> Draft:
+        """Track the frames of a draft by a tracker that has been started, without the cameras (F, C) that are unused;
+        return the draft of it."""
         present = np.flatnonzero(draft.result.status != Status.ABSENT)
         rows = dict(zip(draft.result.frames[present].tolist(), present.tolist(), strict=True))
-        rig, false_alarm = self.task.setup.rig, self.task.settings.region.false_alarm
-        judges = [FrameJudge(tracker, len(rig), self.task.setup.fps, false_alarm) for tracker in trackers]
-        found: list[list[Estimate]] = [[] for _ in trackers]
+        judge = FrameJudge(
+            tracker, len(self.task.setup.rig), self.task.setup.fps, self.task.settings.region.false_alarm
+        )
+        found: list[Estimate] = []
         with open_observations(self.task, lambda _: None) as observations:
             for frame, _ in observations.frames(min(rows), max(rows) + 1):
                 if frame.index in rows:
-                    used = without_cameras(frame, unused[rows[frame.index]])
-                    for tracker, judge, estimates in zip(trackers, judges, found, strict=True):
-                        found_one = judge.judge(frame.index, tracker.step(used))
-                        estimates.append(replace(found_one, masks=None, drawn=None))  # these are large
-                    self.within(len(found[0]) / len(rows))
-        drafts = [draft.copy() for _ in trackers]
-        for one, estimates in zip(drafts, found, strict=True):
-            one.replace(present, estimates)
-        return drafts
+                    estimate = tracker.step(without_cameras(frame, unused[rows[frame.index]]))
+                    # masks are large
+                    found.append(replace(judge.judge(frame.index, estimate), masks=None, drawn=None))
+                    self.within(len(found) / len(rows))
+        again = draft.copy()
+        again.replace(present, found)
+        return again
 
     def _refine_cameras(self, drafts: Sequence[Draft]) -> None:
         """Refine the cameras, and synchronise the masks, if the cameras disagree about the people and

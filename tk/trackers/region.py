@@ -467,7 +467,8 @@ class RegionTracker(ContourTracker[RegionState]):
         frame, the difference to the mean posture until now, what its cues contradict, the modes of the limbs, and
         the spread of the hypotheses."""
         skeleton = self.body.skeleton
-        variance = self.variance(pose, look.curvature, self.prior(pose), look.label, look.residual)
+        covariance = np.linalg.inv(INFORMATION * (look.curvature + self.prior(pose).matrix[0]))
+        variance = self.variance(pose, covariance, look.label, look.residual)
         self._postures = min(self._postures + 1, _POSTURE_FRAMES)
         self._mean_posture += (directions(skeleton, pose) - self._mean_posture) / self._postures
         variance += posture_variance(skeleton, pose, self._mean_posture) + self._spread
@@ -477,23 +478,36 @@ class RegionTracker(ContourTracker[RegionState]):
             variance += disagreement(skeleton, poses, cost)
         return np.asarray(np.sqrt(variance))
 
-    def variance(
-        self, pose: Float, curvature: Float, prior: Quadratic, label: NDArray[np.uint8], residual: Float
-    ) -> Float:
+    def equations(self, pyramid: Pyramid, poses: Float, prior: Quadratic) -> tuple[Float, Float]:
+        """Return the normal equations (B, D, D), (B, D) of B frames at poses (B, D), nats: contours at the finest
+        scale, cues, prior and limits."""
+        skeleton = self.body.skeleton
+        here = normal_equations(self.body.arrays, self.views.at(pyramid, 0), poses, self.line_search)
+        terms = self.terms(pyramid, prior)
+        assert terms is not None
+        linear, matrix = terms(poses)
+        diagonal = np.einsum("bdd->bd", here.hessian)
+        # as in a step of one frame, tk.kernels.newton
+        unit = diagonal.sum(axis=1) / np.maximum(np.count_nonzero(diagonal > 0, axis=1), 1)
+        excess = skeleton.clip(poses) - poses
+        pull = self.solver.limit_weight * unit[:, None] * (excess != 0)
+        hessian = here.hessian + matrix + pull[:, :, None] * np.eye(poses.shape[1])
+        gradient = here.gradient + linear - (matrix @ poses[..., None])[..., 0] + pull * excess
+        return INFORMATION * hessian, INFORMATION * gradient
+
+    def variance(self, pose: Float, covariance: Float, label: NDArray[np.uint8], residual: Float) -> Float:
         """Return (..., J) variance of the joints' positions along an axis, metres², from the contours' noise and the
         directions of the views, scaled by the residual.
 
         Args:
             pose: (..., D).
-            curvature: (..., D, D) JᵀWJ.
-            prior: of the pose.
+            covariance: (..., D, D) of the pose, by the contours' noise.
             label: (..., V, h, w) the parts that the grid's rays meet.
             residual: (..., V, 2); NaN for a view that was not used.
         """
         body = self.body
         joints = body.skeleton.joints(pose)
-        precision = INFORMATION * (curvature + prior.matrix[0])
-        noise = contour_variance(body.skeleton, pose, precision)
+        noise = contour_variance(body.skeleton, pose, covariance)
         rays = joints[..., None, :, :] - self.world.rig.centers[:, None]
         rays /= np.sqrt((rays**2).sum(axis=-1, keepdims=True))
         shares = contour_shares(body, self.screen, label, joints)
@@ -518,8 +532,9 @@ class RegionTracker(ContourTracker[RegionState]):
         again = SecondPass(self, masks, landmarks, self.world.poses_in(poses), lost, residual, report)
         if self.contours.adapt and not keep_body:
             again.fit_body(height_m)
-        again.optimise(again.tracked)
+        again.settle()
         again.decide()
+        again.smooth()
         return np.where(lost[:, None], poses, self.world.poses_out(again.poses)), again.residual, again.sigma
 
     def _nobody(self, frame: Frame, watch: Stopwatch) -> Estimate:

@@ -1,7 +1,7 @@
 """The second pass of the region tracker: what all frames together tell about each one.
 
 Frames of different poses show what an opening hides, even one in the initialisation pose: only a bent knee or elbow
-shows where it is. So the body is fitted to frames of the whole recording, and every frame is optimised again with it.
+shows where it is. So the body is fitted to frames of the whole recording, and all frames are optimised again with it.
 Each frame stays near its pose of the first pass, because that has used colours to locate limbs inside the silhouette.
 This matters with the same body and cameras, too: without it, the limbs' mean error on the eight captures is 0.03 cm
 larger, with two cameras 0.1 cm, and more limbs stay more than 10 cm off.
@@ -11,6 +11,9 @@ poses of the body and of its arms are tracked through the whole recording, forwa
 pose in the neighbouring frame, or at the exchanged legs. A hidden Markov model with two states, the present and the
 other pose, gives the probability of either in each frame, from the costs in all frames and the lengths of the joints'
 steps (Rabiner, Proc. IEEE, 1989). The pose becomes the likelier one, and σ includes the difference.
+
+Then one problem of all frames, coupled by the motion, gives the poses and their covariances
+(:mod:`tk.optim.trajectory`).
 """
 
 from __future__ import annotations
@@ -29,8 +32,11 @@ from tk.model.body.body_fit import STATURE_DEVIATION
 from tk.model.body.joint_sigma import directions, posture_variance
 from tk.model.body.limb_candidates import Limb, exchanged
 from tk.model.body.skeleton import JOINTS
+from tk.model.cameras.bundle import LONGEST_STEP
 from tk.model.cues.ray_costs import residual_of
 from tk.model.masks.silhouettes import Pyramid
+from tk.model.motion.coupling import MotionTerm
+from tk.optim.trajectory import Equations
 from tk.trackers.hypotheses import DROPPED, RENEWAL, SAME_POSE_M
 
 if TYPE_CHECKING:
@@ -45,6 +51,9 @@ ANGLE_DEG = 15.0
 STATURE = 0.03
 # Frames that are refined in one launch.
 AT_ONCE = 16
+# Iterations over all frames together; frames of which the equations are in memory at once, and frames before and after
+# them that are solved with them: what a frame shows about others fades within some frames.
+ROUNDS, WINDOW, OVERLAP = 2, 1000, 30
 # Scale at which other poses are optimised.
 LEVEL = 1
 # Seconds within which frames err alike: the likelihood of a frame counts by its share of this time. At 15 Hz and with
@@ -125,27 +134,58 @@ class SecondPass:
         seen = [self._pyramid(i) for i in chosen]
         fitted = tracker.fit(seen, self.poses[chosen], np.arange(len(chosen)), stature, deviation)
         tracker.take_body(fitted.body)
-        self._body_variance = fitted.variance
+        # in a recording it is a constant offset, which sigma leaves out; few frames do not tell it from an error
+        if len(tracked) <= FIT_FRAMES:
+            self._body_variance = fitted.variance() / len(tracked)
 
-    def optimise(self, frames: NDArray[np.int64]) -> None:
-        """Optimise frames near their present poses."""
-        tracker, grid = self.tracker, self.tracker.screen
-        for chunk in (frames[k : k + AT_ONCE] for k in range(0, len(frames), AT_ONCE)):
-            seen = Pyramid.of_all([self._pyramid(i) for i in chunk], 0)
-            prior = tracker.prior(self.poses[chunk], ANGLE_DEG)
-            settled = tracker.settle(seen, self.poses[chunk], (0,), prior=prior)
-            self.poses[chunk] = settled.states
-            label = grid.render(tracker.body, settled.states).label
-            sampled = grid.sample(seen.masks[0]).reshape(label.shape)
-            residual = residual_of(label > 0, sampled >= PERSON, sampled == OTHERS)
-            self.residual[chunk] = residual
-            variance = tracker.variance(settled.states, settled.hessian, prior, label, residual)
-            self._variance[0, chunk] = variance + tracker.contradiction(seen, settled.states)
-            self._advance(len(chunk))
+    def settle(self) -> None:
+        """Optimise every frame by itself, near its pose of the first pass."""
+        for frames in _chunks(self.tracked):
+            prior = self.tracker.prior(self.poses[frames], ANGLE_DEG)
+            settled = self.tracker.settle(self._together(frames), self.poses[frames], (0,), prior=prior)
+            self.poses[frames] = settled.states
+            self._advance(len(frames))
+
+    def smooth(self) -> None:
+        """Optimise all frames together, each near its present pose and coupled to its neighbours by the motion; give
+        each its residual and its variance."""
+        near = self.poses.copy()
+        for begin in range(0, len(self.tracked), WINDOW):
+            first = max(begin - OVERLAP, 0)
+            frames = self.tracked[first : begin + WINDOW + OVERLAP]
+            poses, covariance = self._smoothed(frames, near[frames])
+            for rows in _chunks(np.arange(begin - first, min(begin - first + WINDOW, len(frames)))):
+                self.poses[frames[rows]] = poses[rows]
+                self._judge(frames[rows], covariance[rows])
+        self._interpolate()
+
+    def _smoothed(self, frames: NDArray[np.int64], near: Float) -> tuple[Float, Float]:
+        """Return the poses (N, D) of frames, near poses (N, D), and their covariances (N, D, D)."""
+        poses, motion = near.copy(), MotionTerm(self.tracker.body.skeleton, near, frames)
+        for _ in range(ROUNDS):
+            equations = Equations(len(poses), poses.shape[1], 0)
+            for rows in _chunks(np.arange(len(frames))):
+                prior = self.tracker.prior(near[rows], ANGLE_DEG)
+                hessian, gradient = self.tracker.equations(self._together(frames[rows]), poses[rows], prior)
+                equations.hessian[rows], equations.gradient[rows] = self._share * hessian, self._share * gradient
+            motion.add(equations, poses)
+            reduced = equations.reduced()
+            poses += np.clip(reduced.plain, -LONGEST_STEP[0], LONGEST_STEP[0])
+            self._advance(len(frames))
+        return poses, reduced.chain.covariance
+
+    def _judge(self, frames: NDArray[np.int64], covariance: Float) -> None:
+        """Set the residuals and the variances of frames, whose poses have covariances (N, D, D)."""
+        tracker, seen, poses = self.tracker, self._together(frames), self.poses[frames]
+        label = tracker.screen.render(tracker.body, poses).label
+        sampled = tracker.screen.sample(seen.masks[0]).reshape(label.shape)
+        self.residual[frames] = residual = residual_of(label > 0, sampled >= PERSON, sampled == OTHERS)
+        variance = tracker.variance(poses, covariance, label, residual)
+        self._variance[0, frames] = variance + tracker.contradiction(seen, poses)
 
     def decide(self) -> None:
         """Track other poses of the limbs in both directions, and replace the present ones where these are likelier."""
-        skeleton, frames, before = self.tracker.body.skeleton, self.tracked, self.poses.copy()
+        skeleton, frames = self.tracker.body.skeleton, self.tracked
         arms = [Alternative(limb.dofs, limb) for limb in self.tracker.limbs if limb.name.startswith("arm")]
         rest = np.setdiff1d(np.arange(self.poses.shape[1]), np.concatenate([arm.dofs for arm in arms]))
         legs = tuple(limb for limb in self.tracker.limbs if limb.name.startswith("leg"))
@@ -162,8 +202,6 @@ class SecondPass:
                 apart = ((joints[1] - joints[0]) ** 2).sum(axis=-1) / 3
                 self._variance[1, frames] += (share * (1.0 - share))[:, None] * apart
                 self.poses[frames[share > 0.5]] = other[frames[share > 0.5]]
-        self.optimise(np.flatnonzero((self.poses != before).any(axis=1)))
-        self._interpolate()
 
     def _interpolate(self) -> None:
         """Set angles that only landmarks show between those of the frames in which two images or more have landmarks:
@@ -249,9 +287,13 @@ class SecondPass:
         return result
 
     def _advance(self, frames: int) -> None:
-        """Report the share that is done: every frame is optimised once and tracked twice, some are optimised again."""
+        """Report the share that is done: every frame is settled once, tracked twice and smoothed in all rounds."""
         self._done += frames
-        self._report(min(self._done / (3 * len(self.tracked)), 1.0))
+        self._report(min(self._done / ((3 + ROUNDS) * len(self.tracked)), 1.0))
+
+    def _together(self, frames: NDArray[np.int64]) -> Pyramid:
+        """Return the finest scale of some frames."""
+        return Pyramid.of_all([self._pyramid(i) for i in frames], 0)
 
     def _pyramid(self, i: int, scales: int = 1) -> Pyramid:
         """Return the scales of the masks of frame i, and its landmarks, by the cameras that are used."""
@@ -290,6 +332,11 @@ def second_of_two(cost: Float, steps: Float) -> Float:
         backward[k - 1] = -np.logaddexp(*(-steps[:, :, k - 1] - (frame + backward)[k]).T)
     first, second = (forward + backward).T
     return np.asarray(1.0 / (1.0 + np.exp(np.clip(second - first, -500.0, 500.0))))
+
+
+def _chunks(frames: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Return frames in pieces of at most :data:`AT_ONCE`."""
+    return [frames[k : k + AT_ONCE] for k in range(0, len(frames), AT_ONCE)]
 
 
 def _lowest(frames: NDArray[np.int64], error: Float, count: int) -> NDArray[np.int64]:

@@ -248,6 +248,6 @@ def test_variance_by_the_body_falls_with_the_frames_and_knows_depth() -> None:
     """A body that one frame shows is less certain than one that six different frames show."""
     poses = walk(AVERAGE, 6)
     seen = pyramids_of(AVERAGE, poses)
-    one, six = (fit_body(VIEWS, seen[:n], poses[:n], SEARCH, STATURE).variance for n in (1, 6))
+    one, six = (fit_body(VIEWS, seen[:n], poses[:n], SEARCH, STATURE).variance() for n in (1, 6))
     assert one.shape == (len(JOINTS),) and (six < one).all()
     assert 0.003 < np.sqrt(one.mean()) < 0.02

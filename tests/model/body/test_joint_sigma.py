@@ -26,7 +26,7 @@ def poses(count: int, spread: float = 0.3) -> np.ndarray:
     return np.random.default_rng(3).normal(scale=spread, size=(count, len(NAMES)))
 
 
-def test_contour_variance_equals_that_of_poses_sampled_from_the_information() -> None:
+def test_contour_variance_equals_that_of_sampled_poses() -> None:
     rng = np.random.default_rng(1)
     pose = poses(1)[0]
     D = len(pose)
@@ -34,15 +34,16 @@ def test_contour_variance_equals_that_of_poses_sampled_from_the_information() ->
     precision = (root @ root.T + np.eye(D)) * 1e6  # deviations of about a thousandth: joints move as the pose does
     drawn = pose + rng.multivariate_normal(np.zeros(D), np.linalg.inv(precision), 4000)
     moved = SKELETON.joints(drawn) - SKELETON.joints(pose)
-    np.testing.assert_allclose(contour_variance(SKELETON, pose, precision), (moved**2).mean(axis=(0, 2)), rtol=0.1)
+    found = contour_variance(SKELETON, pose, np.linalg.inv(precision))
+    np.testing.assert_allclose(found, (moved**2).mean(axis=(0, 2)), rtol=0.1)
 
 
 def test_batched_variances_equal_single_ones() -> None:
     D = len(NAMES)
     root = np.random.default_rng(4).normal(size=(6, D, D))
-    precision = root @ root.swapaxes(1, 2) + np.eye(D)
-    many = contour_variance(SKELETON, poses(6).reshape(2, 3, D), precision.reshape(2, 3, D, D))
-    each = [contour_variance(SKELETON, pose, p) for pose, p in zip(poses(6), precision, strict=True)]
+    covariance = root @ root.swapaxes(1, 2) + np.eye(D)
+    many = contour_variance(SKELETON, poses(6).reshape(2, 3, D), covariance.reshape(2, 3, D, D))
+    each = [contour_variance(SKELETON, pose, C) for pose, C in zip(poses(6), covariance, strict=True)]
     np.testing.assert_allclose(many.reshape(6, -1), each, rtol=1e-9)
 
 

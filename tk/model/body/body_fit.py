@@ -7,7 +7,7 @@ dimensions may change. (The silhouette paper leaves the adaptation of the body t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.line_search import SearchSettings
-from tk.model.block_least_squares import minimise
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_parameters import BodyFamily
 from tk.model.body.cone_body import ConeBody
@@ -29,6 +28,7 @@ from tk.model.cameras.bundle import (
     ContourBundle,
 )
 from tk.model.masks.silhouettes import Pyramid, Views
+from tk.optim.trajectory import minimise
 
 Float = NDArray[np.float64]
 
@@ -48,13 +48,13 @@ class FittedBody(NamedTuple):
     Attributes:
         body: the body.
         poses: (F, D) in the frames.
-        variance: (J,) of the joints' positions along an axis, metres², that the body's uncertainty causes, mean over
-            the frames.
+        variance: computes (J,) variance of the joints' positions along an axis, metres², that the body's uncertainty
+            causes, mean over the frames.
     """
 
     body: ConeBody
     poses: Float
-    variance: Float
+    variance: Callable[[], Float]
 
 
 def fit_body(
@@ -89,7 +89,7 @@ def fit_body(
 
     stiff = bundle(None)
     state = minimise(stiff.start, stiff.linearise, stiff.move, [0] * ROUNDS, LONGEST_STEP).state
-    return FittedBody(stiff.family.build(state.body), state.poses, _joint_variance(bundle(SEGMENT_M), state))
+    return FittedBody(stiff.family.build(state.body), state.poses, lambda: _joint_variance(bundle(SEGMENT_M), state))
 
 
 def _joint_variance(bundle: ContourBundle, state: BundleState) -> Float:

@@ -7,13 +7,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.block_least_squares import Equations, minimise
 from tk.model.body.anthropometry import FRACTIONS, BodyDimensions
 from tk.model.body.gait_poses import neutral_pose
 from tk.model.body.joints import HIPS, LIMBS, SHOULDERS
 from tk.model.body.skeleton import JOINTS, Skeleton, build_skeleton, shoulder_angles
 from tk.model.cameras.tracker_frame import TrackerFrame
 from tk.model.setup import AVERAGE_STATURE_M
+from tk.optim.trajectory import Equations, minimise
 
 Float = NDArray[np.float64]
 

@@ -40,17 +40,16 @@ _TO = np.array([JOINTS.index(end) for _, end in _BONES.values()])
 _TRUNK = SEGMENTS.index("torso")
 
 
-def contour_variance(skeleton: Skeleton, pose: Float, precision: Float) -> Float:
+def contour_variance(skeleton: Skeleton, pose: Float, covariance: Float) -> Float:
     """Return (..., J) variance of the joints' positions along an axis, metres², from the contours' noise.
 
     Args:
         skeleton: of D degrees of freedom.
         pose: (..., D).
-        precision: (..., D, D) information of contours and priors about the pose.
+        covariance: (..., D, D) of the pose.
     """
     J = skeleton.joint_jacobian(pose)  # (..., J, 3, D)
     J = J.reshape(*J.shape[:-3], -1, J.shape[-1])
-    covariance = np.linalg.inv(precision)
     return np.asarray(((J @ covariance) * J).reshape(*J.shape[:-2], len(JOINTS), -1).sum(axis=-1) / 3)
 
 

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.line_search import SearchSettings
-from tk.model.block_least_squares import gauge_projection
 from tk.model.cameras.bundle import SPACING_PX
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.people_bundle import Filmed, PeopleBundle
+from tk.optim.trajectory import gauge_projection
 
 Float = NDArray[np.float64]
 

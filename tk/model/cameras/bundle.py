@@ -5,7 +5,7 @@ moves by n·Jπ·∂x/∂δ, where x is the material point of the contour: the s
 tangent only. This holds for the pose, for the body (:mod:`tk.model.body.body_parameters`) and for a moving camera. A
 camera's frame k is taken ``offset`` frames later than k, so the body is rendered for it at θ_k + offset · dθ/dk.
 
-The poses are the blocks of :mod:`tk.model.block_least_squares`; cameras and body are the unknowns that frames share.
+The poses are the blocks of :mod:`tk.optim.trajectory`; cameras and body are the unknowns that frames share.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from tk.kernels.line_search import SearchSettings
 from tk.kernels.silhouette import Edgels, find_edgels
-from tk.model.block_least_squares import Equations
 from tk.model.body.body_parameters import BodyFamily
 from tk.model.body.skeleton import SEGMENTS, Skeleton
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cues.landmarks import LandmarkCue
 from tk.model.masks.silhouettes import Pyramid, Views
+from tk.optim.trajectory import Equations
 
 Float = NDArray[np.float64]
 

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.line_search import SearchSettings
-from tk.model.block_least_squares import Equations
 from tk.model.body.body_parameters import BodyFamily
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.bundle import BundleFrame, BundleState, ContourBundle, Contours
 from tk.model.cameras.camera import Rig
+from tk.optim.trajectory import Equations
 
 Float = NDArray[np.float64]
 

@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
-from tk.model.block_least_squares import gauge_projection, minimise
 from tk.model.cameras.agreement import CAMERA_SEARCH, SCALE_DEVIATION
 from tk.model.cameras.bundle import CAMERA_PARAMETERS, LONGEST_STEP, residual_px
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.people_bundle import Filmed, PeopleBundle
+from tk.optim.trajectory import gauge_projection, minimise
 
 Float = NDArray[np.float64]
 

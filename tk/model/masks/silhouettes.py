@@ -79,6 +79,8 @@ class Views:
 
     def pyramid(self, masks: Masks, scales: int, cleaning: bool, landmarks: Float | None = None) -> Pyramid:
         """Return the scales of masks (V, H, W), cleaned if ``cleaning``, with landmarks (V, L, 4)."""
+        if scales == 1 and not cleaning:
+            return Pyramid((masks,), (self.sizes,), landmarks)
         # everything happens inside boxes around the people
         crops = [(slice(y, y + h), slice(x, x + w)) for x, y, w, h in map(cv2.boundingRect, masks)]
         shared = any((mask[crop] == OTHERS).any() for mask, crop in zip(masks, crops, strict=True))
