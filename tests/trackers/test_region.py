@@ -22,6 +22,7 @@ from tk.model.cameras.volume import Volume
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.setup import InitPose, Setup, Subject
 from tk.settings import RegionSettings, Settings, SilhouetteSettings
+from tk.trackers import second_pass
 from tk.trackers.judgement import UNKNOWN_AFTER
 from tk.trackers.proposals import anywhere, limbs
 from tk.trackers.proposals import exchanged as exchanged_limbs
@@ -485,6 +486,23 @@ def test_probability_of_two_states_is_that_of_all_paths(seed: int) -> None:
     # a cost of thousands is no overflow
     found = second_of_two(np.array([1e4, -1e4]), np.zeros((2, 2, 1)))
     np.testing.assert_allclose(found, [0.0, 1.0], atol=1e-100)
+
+
+def test_a_long_recording_is_solved_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    tracker = tracker_at(POSES[0])
+
+    def solved() -> np.ndarray:
+        found = tracker.second_pass(MASKS, POSES + 0.01, np.zeros(6, bool), np.zeros((6, 3, 2)), None, keep_body=True)
+        assert (found[2] > 0).all()
+        return SKELETON.joints(found[0])
+
+    whole, off = solved(), []
+    monkeypatch.setattr(second_pass, "WINDOW", 2)
+    for overlap in (4, 3, 0):
+        monkeypatch.setattr(second_pass, "OVERLAP", overlap)
+        off.append(np.abs(solved() - whole).max())
+    assert off[0] < 1e-9, "every piece has all frames"
+    assert off[1] < off[2] < 0.05, "a frame depends on its neighbours, less on those far away"
 
 
 def test_second_pass_keeps_a_given_body() -> None:

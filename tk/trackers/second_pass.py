@@ -149,26 +149,27 @@ class SecondPass:
     def smooth(self) -> None:
         """Optimise all frames together, each near its present pose and coupled to its neighbours by the motion; give
         each its residual and its variance."""
-        near = self.poses.copy()
+        near, skeleton = self.poses.copy(), self.tracker.body.skeleton
+        motion = MotionTerm(skeleton, near[self.tracked], self.tracked)
         for begin in range(0, len(self.tracked), WINDOW):
             first = max(begin - OVERLAP, 0)
             frames = self.tracked[first : begin + WINDOW + OVERLAP]
-            poses, covariance = self._smoothed(frames, near[frames])
+            poses, covariance = self._smoothed(frames, near[frames], motion)
             for rows in _chunks(np.arange(begin - first, min(begin - first + WINDOW, len(frames)))):
                 self.poses[frames[rows]] = poses[rows]
                 self._judge(frames[rows], covariance[rows])
         self._interpolate()
 
-    def _smoothed(self, frames: NDArray[np.int64], near: Float) -> tuple[Float, Float]:
+    def _smoothed(self, frames: NDArray[np.int64], near: Float, motion: MotionTerm) -> tuple[Float, Float]:
         """Return the poses (N, D) of frames, near poses (N, D), and their covariances (N, D, D)."""
-        poses, motion = near.copy(), MotionTerm(self.tracker.body.skeleton, near, frames)
+        poses = near.copy()
         for _ in range(ROUNDS):
             equations = Equations(len(poses), poses.shape[1], 0)
             for rows in _chunks(np.arange(len(frames))):
                 prior = self.tracker.prior(near[rows], ANGLE_DEG)
                 hessian, gradient = self.tracker.equations(self._together(frames[rows]), poses[rows], prior)
                 equations.hessian[rows], equations.gradient[rows] = self._share * hessian, self._share * gradient
-            motion.add(equations, poses)
+            motion.add(equations, poses, frames)
             reduced = equations.reduced()
             poses += np.clip(reduced.plain, -LONGEST_STEP[0], LONGEST_STEP[0])
             self._advance(len(frames))

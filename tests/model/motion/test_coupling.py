@@ -26,7 +26,7 @@ def smoothed(poses: np.ndarray, frames: np.ndarray, unseen: tuple[int, ...] = ()
     equations = Equations(len(poses), D, 0)
     precision = np.where(np.isin(np.arange(len(poses)), unseen), 1e-6, PRECISION)
     equations.hessian += precision[:, None, None] * np.eye(D)
-    MotionTerm(SKELETON, poses, frames).add(equations, poses)
+    MotionTerm(SKELETON, poses, frames).add(equations, poses, frames)
     reduced = equations.reduced()
     return poses + reduced.plain, np.sqrt(np.einsum("fdd->fd", reduced.chain.covariance))
 
@@ -82,5 +82,6 @@ def test_angles_turn_the_shorter_way_and_places_do_not() -> None:
 @pytest.mark.parametrize("frames", [[0], [0, 1], [0, 2, 4, 6]])
 def test_frames_that_show_no_change_of_speed_are_not_coupled(frames: list[int]) -> None:
     equations, poses = Equations(len(frames), D, 0), moving(len(frames))
-    MotionTerm(SKELETON, poses, np.array(frames)).add(equations, poses)
+    numbers = np.array(frames)
+    MotionTerm(SKELETON, poses, numbers).add(equations, poses, numbers)
     assert equations.coupling is None and not equations.hessian.any()

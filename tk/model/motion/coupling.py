@@ -24,18 +24,17 @@ _ROUNDS = 10
 
 
 class MotionTerm:
-    """The term for the poses of F frames.
+    """The term for poses of a recording.
 
     Args:
         skeleton: of D degrees of freedom.
-        poses: (F, D) about which the changes of speed are measured.
+        poses: (F, D) of which the changes of speed are measured.
         frames: (F,) numbers of the frames, ascending; the term connects consecutive ones.
     """
 
     def __init__(self, skeleton: Skeleton, poses: Float, frames: NDArray[np.int64]) -> None:
         self._prismatic = skeleton.prismatic
-        self._next = np.diff(frames) == 1
-        changes = self._changes(self._steps(poses)) ** 2
+        changes = np.diff(self._steps(poses), axis=0)[_between_steps(frames)] ** 2
         # With white acceleration of variance q, two steps in turn differ by 2/3 q in the mean square.
         self._variance = np.full(poses.shape[1], np.inf)
         if len(changes):
@@ -49,25 +48,28 @@ class MotionTerm:
         steps = np.diff(poses, axis=0)
         return np.where(self._prismatic, steps, (steps + np.pi) % (2 * np.pi) - np.pi)
 
-    def _changes(self, steps: Float) -> Float:
-        """Return the differences (N, D) of steps in turn."""
-        return np.asarray(np.diff(steps, axis=0)[self._next[1:] & self._next[:-1]])
-
-    def add(self, equations: Equations, poses: Float) -> None:
-        """Add the term at poses (F, D) to the equations of F blocks. The speeds are those of the poses."""
+    def add(self, equations: Equations, poses: Float, frames: NDArray[np.int64]) -> None:
+        """Add the term at poses (N, D) of frames (N,) to the equations of N blocks. The speeds are those of the
+        poses."""
         if not np.isfinite(self._variance).all():
             return
         steps = self._steps(poses)
         total, count = 2.0 * steps, np.full((len(steps), 1), 2.0)
-        both = np.flatnonzero(self._next[1:] & self._next[:-1])
+        both = np.flatnonzero(_between_steps(frames))
         for here, beside in ((both + 1, both), (both, both + 1)):
             total[here] += steps[beside]
             count[here] += 1.0
-        rows = np.flatnonzero(self._next)
+        rows = np.flatnonzero(np.diff(frames) == 1)
         missing, one = (total / count - steps)[rows], np.eye(poses.shape[1])
         # by a third of q a step differs from the speed before it
         variance = self._variance / 3.0
         equations.couple(rows, -one, one, _tail(missing**2, variance) / variance, missing)
+
+
+def _between_steps(frames: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return (F - 2,) whether the two steps beside a frame lead from frame to frame."""
+    follows = np.diff(frames) == 1
+    return np.asarray(follows[1:] & follows[:-1])
 
 
 def _tail(square: Float, variance: Float) -> Float:
