@@ -112,11 +112,14 @@ class PartColors(Stateful[LearnedColors]):
         self.mismatch = np.ascontiguousarray(np.minimum(deficit, 1.0).T)
         self.foreign = outside + _ANYTHING * total[-1] / COLOR_BINS > rows[-1]
 
-    def regions(self, images: NDArray[np.uint8]) -> Regions | None:
-        """Return the colour cue of images (V, H, W, 3) for the contours; None before any colours are learned."""
+    def regions(self, images: NDArray[np.uint8], step: int) -> Regions | None:
+        """Return the colour cue of images (V, h, w, 3) for the contours; None before any colours are learned.
+
+        ``step``: pixels of the cameras along an edge of a pixel of the images.
+        """
         if self.log_likelihood is None:
             return None
-        return Regions(np.ascontiguousarray(images), self.log_likelihood, _CONTOUR_WEIGHT)
+        return Regions(np.ascontiguousarray(images), self.log_likelihood, _CONTOUR_WEIGHT, step)
 
     def likeness(self, bins: NDArray[np.int32]) -> float:
         """Return the mean log-likelihood of colours (N,), relative to that of the learned colours: about 0 if they are
