@@ -143,9 +143,7 @@ def color_bin(image: ti.template(), v: int, j: int, i: int):
 
 
 @ti.func
-def search_colors(
-    image: ti.template(), likelihood: ti.template(), v: int, step, x, n, window, scale, front, back
-):
+def search_colors(image: ti.template(), likelihood: ti.template(), v: int, step, x, n, window, scale, front, back):
     """Return (certainty in [0, 1], mean place) of the border between two colour groups on the line x + s n.
 
     The border lies behind step d with a probability proportional to the exponential of the summed log ratios of the
