@@ -460,8 +460,7 @@ class RegionTracker(ContourTracker[RegionState]):
         """Return how the best pose explains the frame."""
         best = self._best.pose[None]
         _, met = seen.evidence.cast(self.body, best)
-        step = 0 if seen.images is None else self.screen.image_step(seen.images)
-        regions = None if seen.images is None else self.colors.regions(seen.images, step)
+        regions = None if seen.images is None else self.colors.regions(seen.images, self.views.rig.frame_shape)
         here = normal_equations(self.body.arrays, self.views.at(seen.pyramid, 0), best, self.line_search, regions)
         return _Look(met.label[0], here.hessian[0], seen.evidence.residual(met.label[0]))
 

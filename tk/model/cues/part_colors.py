@@ -112,13 +112,12 @@ class PartColors(Stateful[LearnedColors]):
         self.mismatch = np.ascontiguousarray(np.minimum(deficit, 1.0).T)
         self.foreign = outside + _ANYTHING * total[-1] / COLOR_BINS > rows[-1]
 
-    def regions(self, images: NDArray[np.uint8], step: int) -> Regions | None:
-        """Return the colour cue of images (V, h, w, 3) for the contours; None before any colours are learned.
-
-        ``step``: pixels of the cameras along an edge of a pixel of the images.
-        """
-        if self.log_likelihood is None:
+    def regions(self, images: NDArray[np.uint8], size: tuple[int, int]) -> Regions | None:
+        """Return the colour cue of images (V, h, w, 3), reduced or not, of cameras of a ``size`` (H, W), for the
+        contours; None without images, and before any colours are learned."""
+        if self.log_likelihood is None or not images.size:
             return None
+        step = size[0] // images.shape[1]
         return Regions(np.ascontiguousarray(images), self.log_likelihood, _CONTOUR_WEIGHT, step)
 
     def likeness(self, bins: NDArray[np.int32]) -> float:

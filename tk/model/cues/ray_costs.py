@@ -73,10 +73,6 @@ class RayGrid:
         reduced."""
         return every(images, self.rig.frame_shape, self.step)
 
-    def image_step(self, images: NDArray) -> int:
-        """Return how many pixels of the cameras lie along an edge of a pixel of images (V, h, w, ...)."""
-        return self.rig.frame_shape[0] // images.shape[1]
-
     def render(self, body: ConeBody, poses: Float) -> Cast:
         """Return the parts of the body that the rays meet at poses (B, D): labels and depths (B, V, h, w)."""
         free = np.zeros((*self.rays.shape[:3], 2), np.float32)
