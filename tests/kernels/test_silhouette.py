@@ -427,7 +427,7 @@ def _border(
 ):
     x, n = ti.Vector([start[0], start[1]]), ti.Vector([normal[0], normal[1]])
     for _ in range(1):
-        certainty, place = search_colors(image, likelihood, 0, step, x, n, window, scale, 0, 1)
+        certainty, place = search_colors(image, likelihood, 0, 1.0 / step, x, n, window, scale, 0, 1)
         found[0], found[1] = certainty, place
 
 

@@ -48,7 +48,7 @@ from tk.kernels.wrench import (
 _EXPORT = 13
 # Columns of the packed settings. SCALE: pixels of the full picture in one of this scale; the others: SearchSettings.
 _NUMBERS = tuple(range(12))
-SCALE, WINDOW, SPACING, AMBIGUOUS, TANGENTIAL, ROBUST, LOST, COLORS, MOST_SAMPLES, INTERIOR, EXPORT, STEP_PX = _NUMBERS
+SCALE, WINDOW, SPACING, AMBIGUOUS, TANGENTIAL, ROBUST, LOST, COLORS, MOST_SAMPLES, INTERIOR, EXPORT, RATIO = _NUMBERS
 # Columns of ``sums``: cost, weight of the samples that found an edge, weight of all, steps made; then the gradient.
 COST, FOUND, ALL, STEPS, GRADIENT = range(5)
 
@@ -236,7 +236,7 @@ def search_contours(
                     other_limb = parts[behind, PART_LIMB] != parts[p, PART_LIMB]
                     if numbers[COLORS] > 0.0 and other_limb and front != back:
                         certainty, place = search_colors(
-                            image, likelihood, v, numbers[STEP_PX], pixel, n, window, scale, front, back
+                            image, likelihood, v, numbers[RATIO], pixel, n, window, scale, front, back
                         )
                         found, d, weight = 2, place * scale, share * numbers[COLORS] * certainty
                 elif use:
@@ -282,7 +282,7 @@ def _descent_kernel(real):
         image: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (V, H, W, 3) of the full picture
         likelihood: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (G, COLOR_BINS)
         # settings
-        numbers: ti.types.ndarray(dtype=real, ndim=1),  # (12,) from SCALE to STEP_PX
+        numbers: ti.types.ndarray(dtype=real, ndim=1),  # (12,) from SCALE to RATIO
         free: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (n,) this and the next three: :class:`NewtonSteps`
         terms: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (2 + B, D)
         matrix: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (B, D, D) or (1, D, D)
@@ -390,9 +390,9 @@ def _no_steps(parameters: int) -> NewtonSteps:
 def _numbers(
     s: SearchSettings, scale: float, weight: float, step: int, export: bool, dtype: np.dtype
 ) -> NDArray[np.floating]:
-    """Pack the settings in the order from SCALE to STEP_PX."""
+    """Pack the settings in the order from SCALE to RATIO."""
     pixels = scale, s.window_px, s.spacing_px, s.ambiguous_px, s.tangential, s.robust_px, s.lost_px
-    return np.array((*pixels, weight, s.most_samples, s.interior, export, step), dtype)
+    return np.array((*pixels, weight, s.most_samples, s.interior, export, 1 / step), dtype)
 
 
 @functools.cache
