@@ -422,21 +422,22 @@ def _border(
     normal: ti.types.ndarray(dtype=ti.f64, ndim=1),
     window: ti.f64,
     scale: ti.f64,
+    step: ti.f64,
     found: ti.types.ndarray(dtype=ti.f64, ndim=1),
 ):
     x, n = ti.Vector([start[0], start[1]]), ti.Vector([normal[0], normal[1]])
     for _ in range(1):
-        certainty, place = search_colors(
-            image, likelihood, 0, image.shape[2], image.shape[1], x, n, window, scale, 0, 1
-        )
+        certainty, place = search_colors(image, likelihood, 0, 1.0 / step, x, n, window, scale, 0, 1)
         found[0], found[1] = certainty, place
 
 
-def border(image, likelihood, start, normal, window=8.0, scale=1.0):
+def border(image, likelihood, start, normal, window=8.0, scale=1.0, step=1.0):
     """(certainty, place in pixels of the scale) of the border between group 0 and group 1."""
     ensure_runtime()
     found = np.empty(2)
-    _border(image[None], likelihood.astype(np.float32), np.array(start, float), np.array(normal), window, scale, found)
+    _border(
+        image[None], likelihood.astype(np.float32), np.array(start, float), np.array(normal), window, scale, step, found
+    )
     return found
 
 
@@ -455,17 +456,18 @@ def two_colors():
     turn=st.floats(0, 2 * np.pi),
     place=st.floats(-4, 4),
     scale=st.sampled_from([1.0, 2.0]),
+    step=st.sampled_from([1.0, 2.0]),
 )
 @few
-def test_the_border_between_two_colors_is_found(turn, place, scale):
-    """A half-plane of either colour: the border is found to a pixel or so, and is certain."""
+def test_the_border_between_two_colors_is_found(turn, place, scale, step):
+    """A half-plane of either colour, also in a reduced image: the border is found to a pixel or so, and is certain."""
     n, start = np.array([np.cos(turn), np.sin(turn)]), np.array([41.3, 38.7])
-    y, x = np.mgrid[:80, :80]
+    y, x = (np.mgrid[: 80 // step, : 80 // step] + 0.5) * step - 0.5
     inside = (x - start[0]) * n[0] + (y - start[1]) * n[1] < place * scale
     image = np.where(inside[..., None], RED, BLUE).astype(np.uint8)
-    certainty, found = border(image, two_colors(), start, n, scale=scale)
+    certainty, found = border(image, two_colors(), start, n, scale=scale, step=step)
     # pixels along a slanting line are met up to half a diagonal off
-    assert abs(found - place) < 0.5 + 0.71 / scale
+    assert abs(found - place) < 0.5 + 0.71 * step / scale
     assert certainty > 0.8
 
 

@@ -51,16 +51,14 @@ def nobody(text: str) -> None:
     raise AssertionError(text)
 
 
-@pytest.mark.parametrize(
-    ("masks", "keep_images", "doubts"), [("auto", True, False), ("none", True, True), ("none", False, False)]
-)
-def test_prefetched_frames_equal_direct_ones(tiny: Path, masks: str, keep_images: bool, doubts: bool) -> None:
+@pytest.mark.parametrize(("masks", "image_step", "doubts"), [("auto", 1, False), ("none", 2, True), ("none", 0, False)])
+def test_prefetched_frames_equal_direct_ones(tiny: Path, masks: str, image_step: int, doubts: bool) -> None:
     """Given masks are not in doubt; without pictures nobody asks for what is."""
     capture = open_capture(tiny, masks=masks)
-    theirs = arrays(Ahead(Task.of(capture, AHEAD), nobody, keep_images), 2, FRAMES)
-    ours = arrays(Serial(Task.of(capture, AHEAD), nobody, keep_images), 2, FRAMES)
+    theirs = arrays(Ahead(Task.of(capture, AHEAD), nobody, image_step), 2, FRAMES)
+    ours = arrays(Serial(Task.of(capture, AHEAD), nobody, image_step), 2, FRAMES)
     assert [frame[0] for frame in theirs] == list(range(2, FRAMES))
-    assert ours[0][2].any() and (ours[0][1].size > 0) == keep_images
+    assert ours[0][2].any() and (ours[0][1].size > 0) == (image_step > 0)
     for a, b in zip(theirs, ours, strict=True):
         np.testing.assert_array_equal(a[1], b[1], strict=True)
         np.testing.assert_array_equal(a[2], b[2], strict=True)

@@ -47,8 +47,8 @@ from tk.kernels.wrench import (
 # Columns of an exported sample: see Edgels.
 _EXPORT = 13
 # Columns of the packed settings. SCALE: pixels of the full picture in one of this scale; the others: SearchSettings.
-_NUMBERS = tuple(range(11))
-SCALE, WINDOW, SPACING, AMBIGUOUS, TANGENTIAL, ROBUST, LOST, COLORS, MOST_SAMPLES, INTERIOR, EXPORT = _NUMBERS
+_NUMBERS = tuple(range(12))
+SCALE, WINDOW, SPACING, AMBIGUOUS, TANGENTIAL, ROBUST, LOST, COLORS, MOST_SAMPLES, INTERIOR, EXPORT, RATIO = _NUMBERS
 # Columns of ``sums``: cost, weight of the samples that found an edge, weight of all, steps made; then the gradient.
 COST, FOUND, ALL, STEPS, GRADIENT = range(5)
 
@@ -236,9 +236,8 @@ def search_contours(
                     other_limb = parts[behind, PART_LIMB] != parts[p, PART_LIMB]
                     if numbers[COLORS] > 0.0 and other_limb and front != back:
                         certainty, place = search_colors(
-                            image, likelihood, v, image.shape[2], image.shape[1], pixel, n, window, scale, front,
-                            back,
-                        )  # fmt: skip
+                            image, likelihood, v, numbers[RATIO], pixel, n, window, scale, front, back
+                        )
                         found, d, weight = 2, place * scale, share * numbers[COLORS] * certainty
                 elif use:
                     found, d = search_mask(mask, frame * V + v, width, height, at, n, window)
@@ -283,7 +282,7 @@ def _descent_kernel(real):
         image: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (V, H, W, 3) of the full picture
         likelihood: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (G, COLOR_BINS)
         # settings
-        numbers: ti.types.ndarray(dtype=real, ndim=1),  # (11,) from SCALE to EXPORT
+        numbers: ti.types.ndarray(dtype=real, ndim=1),  # (12,) from SCALE to RATIO
         free: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (n,) this and the next three: :class:`NewtonSteps`
         terms: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (2 + B, D)
         matrix: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (B, D, D) or (1, D, D)
@@ -368,7 +367,7 @@ def _launch(
         np.ascontiguousarray(seen.masks),
         regions.image,
         regions.log_likelihood,
-        _numbers(settings, seen.scale, regions.weight, export, dtype),
+        _numbers(settings, seen.scale, regions.weight, regions.step, export, dtype),
         *(newton or _no_steps(D)),
         spread_of(B),
         state,
@@ -388,10 +387,12 @@ def _no_steps(parameters: int) -> NewtonSteps:
 
 
 @functools.lru_cache(64)
-def _numbers(s: SearchSettings, scale: float, weight: float, export: bool, dtype: np.dtype) -> NDArray[np.floating]:
-    """Pack the settings in the order from SCALE to EXPORT."""
+def _numbers(
+    s: SearchSettings, scale: float, weight: float, step: int, export: bool, dtype: np.dtype
+) -> NDArray[np.floating]:
+    """Pack the settings in the order from SCALE to RATIO."""
     pixels = scale, s.window_px, s.spacing_px, s.ambiguous_px, s.tangential, s.robust_px, s.lost_px
-    return np.array((*pixels, weight, s.most_samples, s.interior, export), dtype)
+    return np.array((*pixels, weight, s.most_samples, s.interior, export, 1 / step), dtype)
 
 
 @functools.cache

@@ -27,6 +27,7 @@ from tk.model.cameras.camera import Rig
 from tk.model.cues.landmarks import LEAST_OVERLAP
 from tk.model.cues.part_colors import RenderedBody, color_bins
 from tk.model.cues.ray_costs import RayGrid
+from tk.model.reduced_images import crop
 from tk.trackers.protocol import Frame
 
 Float = NDArray[np.float64]
@@ -156,7 +157,7 @@ def assign(
         stranger = _stranger(shown[v][cells], shapes, cell, least, own.get(NOBODY))
         view = _View(grid.step, shown[v][cells], [*shapes, *stranger], own)
         pixels = _pixels(cells, grid.step)
-        image = frame.images[v][pixels] if colored else None
+        image = crop(frame.images[v], frame.masks.shape[1:], *pixels) if colored else None
         owner[v][pixels] = view.owners(frame.masks[v][pixels] >= PERSON, image)
     return PixelOwners(grid, owner, len(bodies))
 

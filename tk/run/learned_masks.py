@@ -122,7 +122,7 @@ class LearnedMasks:
             whole = before.seen if before and asked else self._people.label(frame.images)
             kind = np.full(self._cameras, SEGMENTER, np.uint8)
             return whole.masks, whole.uncertain, kind, whole.landmarks, whole.people
-        masks, uncertain = span.foreground.label(frame.images, _between(before, after))
+        masks, uncertain = span.foreground.label(frame.images, frame.halved, _between(before, after))
         kind = np.full(self._cameras, LEARNED_AND_SEGMENTER if asked else LEARNED, np.uint8)
         failed, seen = ~(before.agrees & after.agrees), before.seen if asked else None
         if failed.any():
@@ -195,7 +195,7 @@ def _checked(foreground: CollinearityForeground | None, images: Masks, asked: _A
     index, seen = asked
     if foreground is None:
         return _Sample(index, seen, np.zeros(len(seen.masks), np.bool_))
-    found = foreground.label(images, (seen.masks, seen.uncertain))[0]
+    found = foreground.label(images, prior=(seen.masks, seen.uncertain))[0]
     one, either = (np.count_nonzero(pixels, axis=(1, 2)) for pixels in (found ^ seen.masks, found | seen.masks))
     return _Sample(index, seen, one <= _DISAGREE * either)
 

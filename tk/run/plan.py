@@ -227,6 +227,6 @@ def open_plan(task: Task, note: Callable[[str], None], film: Film | None = None)
     if film is not None and stop is not None:
         film.frames = filmed(begin, stop, setup.fps)
     # the process of the observations starts while this one makes tables and compiles
-    with open_observations(task, note, kind.needs_images, film) as observations:
+    with open_observations(task, note, kind.image_step, film) as observations:
         _LOG.info("preparing the %s tracker", task.options.method)
         yield Plan(task, observations, kind.of(setup, task.settings), first, begin, stop)

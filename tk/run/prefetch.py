@@ -84,13 +84,14 @@ class Observations(Protocol):
     ) -> None: ...
 
 
-def open_observations(task: Task, note: Note, keep_images: bool = True, film: Film | None = None) -> Observations:
+def open_observations(task: Task, note: Note, image_step: int = 1, film: Film | None = None) -> Observations:
     """Return the observations of a source, made ahead if there is a second core and ``settings.ahead`` is not 0.
 
     Args:
         task: its source yields the frames.
         note: called with each line that the user should read.
-        keep_images: False leaves the images empty, (C, 0, 0, 3), and no uncertain pixels, for a tracker of masks alone.
+        image_step: as the tracker's; 2 reduces the images, (C, H // 2, W // 2, 3), 0 leaves them empty, (C, 0, 0, 3),
+            without uncertain pixels.
         film: takes small images of the frames.
 
     Raises:
@@ -99,13 +100,13 @@ def open_observations(task: Task, note: Note, keep_images: bool = True, film: Fi
     mask_source(task.source)  # before a process is started
     if task.settings.ahead and worker.cores() > 1 and sys.executable and _can_be_sent(task.source.segmenter):
         try:
-            return Ahead(task, note, keep_images, film)
+            return Ahead(task, note, image_step, film)
         except OSError as error:  # ulimit -f, -n or -v
             note(
                 f"no memory can be shared with another process ({error.strerror}): frames are made one after the other"
             )
     worker.dismiss()
-    return Serial(task, note, keep_images, film)
+    return Serial(task, note, image_step, film)
 
 
 def _can_be_sent(segmenter: Segmenter | None) -> bool:
@@ -118,7 +119,7 @@ def _can_be_sent(segmenter: Segmenter | None) -> bool:
 
 
 def observe(
-    task: Task, label: Labeller, note: Note, span: tuple[int, int | None], keep_images: bool, film: Film | None
+    task: Task, label: Labeller, note: Note, span: tuple[int, int | None], image_step: int, film: Film | None
 ) -> Iterator[tuple[Frame, Stopwatch]]:
     """Decode and segment frames in this process; ``span``: first frame, and the end, exclusive."""
     shapes = [(camera.height, camera.width) for camera in task.setup.rig]
@@ -131,10 +132,11 @@ def observe(
             if film is not None:
                 film.put(frame.index, [image[:h, :w] for image, (h, w) in zip(frame.images, shapes, strict=True)], note)
             watch.lap("decode")
-            labelled = Frame(frame.index, frame.images, time=frame.time, **label(frame)._asdict())
-            if not keep_images:
-                empty = np.empty((len(labelled.masks), 0, 0, 3), np.uint8)
-                labelled = replace(labelled, images=empty, uncertain=None)
+            labels = label(frame)
+            images = frame.halved if image_step == 2 else frame.images
+            if not image_step:
+                images, labels = np.empty((len(images), 0, 0, 3), np.uint8), labels._replace(uncertain=None)
+            labelled = Frame(frame.index, images, time=frame.time, **labels._asdict())
             watch.lap("masks")
             yield labelled, watch
 
@@ -145,13 +147,13 @@ class Serial:
 
     task: Task
     note: Note
-    keep_images: bool = True
+    image_step: int = 1
     film: Film | None = None
 
     def frames(self, start: int, stop: int | None) -> Iterator[Observed]:
         label = make_labeller(self.task, self.note)
         span = start, stop
-        for observation, watch in observe(self.task, label, self.note, span, self.keep_images, self.film):
+        for observation, watch in observe(self.task, label, self.note, span, self.image_step, self.film):
             yield observation, {**watch.laps, "wait": sum(watch.laps.values())}
 
     def __enter__(self) -> Serial:
@@ -169,7 +171,7 @@ class _Order:
     """What the process needs first; the span of frames follows."""
 
     task: Task
-    keep_images: bool
+    image_step: int
     slots: int
     film: Film | None
 
@@ -195,9 +197,10 @@ class _Failed:
 class _Layout:
     """Size of a slot, and the position of its layers: images, masks, uncertain pixels."""
 
-    def __init__(self, rig: Rig, keep_images: bool) -> None:
+    def __init__(self, rig: Rig, image_step: int) -> None:
         self.masks = (len(rig), *rig.frame_shape)
-        self.images = (*self.masks, 3) if keep_images else (len(rig), 0, 0, 3)
+        height, width = (side // image_step if image_step else 0 for side in rig.frame_shape)
+        self.images = (len(rig), height, width, 3)
         page = mmap.ALLOCATIONGRANULARITY
         self.bytes = -(-(math.prod(self.images) + 2 * math.prod(self.masks)) // page) * page
 
@@ -230,9 +233,9 @@ class Ahead:
     it receives, the tracker gives the process a free slot, so the process always has ``settings.ahead`` of them.
     """
 
-    def __init__(self, task: Task, note: Note, keep_images: bool = True, film: Film | None = None) -> None:
+    def __init__(self, task: Task, note: Note, image_step: int = 1, film: Film | None = None) -> None:
         self._where, self._note = task.source.where, note
-        self._layout = _Layout(task.setup.rig, keep_images)
+        self._layout = _Layout(task.setup.rig, image_step)
         slots = max(min(task.settings.ahead, _AHEAD_BYTES // self._layout.bytes), 1)
         size = (slots + _SPARE) * self._layout.bytes  # the system provides memory where it is written
         handle = _nameless_file(size)
@@ -248,7 +251,7 @@ class Ahead:
         finally:
             os.close(handle)
         self._connection = Connection(started.end.detach())
-        self._send(_Order(task, keep_images, slots, film))
+        self._send(_Order(task, image_step, slots, film))
 
     def frames(self, start: int, stop: int | None) -> Iterator[Observed]:
         self._begun = True
@@ -345,7 +348,7 @@ class _Slots:
     def __init__(self, tracker: Connection, memory: mmap.mmap, order: _Order) -> None:
         self._tracker = tracker
         self._memory = memory
-        self._layout = _Layout(order.task.setup.rig, order.keep_images)
+        self._layout = _Layout(order.task.setup.rig, order.image_step)
         self._free = list(range(order.slots))
 
     def put(self, observation: Frame, watch: Stopwatch) -> None:
@@ -404,6 +407,6 @@ def _serve(tracker: Connection, memory: mmap.mmap, film_handle: Sequence[int]) -
     label = make_labeller(order.task, tracker.send)
     slots = _Slots(tracker, memory, order)
     span: tuple[int, int | None] = tracker.recv()
-    for observation, watch in observe(order.task, label, tracker.send, span, order.keep_images, film):
+    for observation, watch in observe(order.task, label, tracker.send, span, order.image_step, film):
         slots.put(observation, watch)
     tracker.send(None)

@@ -59,7 +59,7 @@ def refine_capture(
         )
     source = reduce_images(capture, config.person_pixels)
     world, store = TrackerFrame.of(source.rig, source.up), MaskStore()
-    with open_observations(Task.of(source, config), note, keep_images=False) as observations:
+    with open_observations(Task.of(source, config), note, image_step=0) as observations:
         for observation, _ in observations.frames(int(found.frames.min()), int(found.frames.max()) + 1):
             store.put(observation.index, observation.masks)
     poses = TrackedPoses(found.frames, world.poses_in(tracked[1]), found.has_pose)

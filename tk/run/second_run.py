@@ -145,7 +145,7 @@ def track_again(
         frames = (
             Frame(
                 frame.index,
-                frame.images,
+                frame.halved,
                 masks.get(frame.index),
                 time=frame.time,
                 landmarks=landmarks[frame.index][None] if frame.index in landmarks else None,

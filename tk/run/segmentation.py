@@ -162,7 +162,7 @@ def _labeller(task: Task, note: Callable[[str], None]) -> Labeller:
         clips = source.background()
         assert clips is not None
         return _against_scene(task, clips)
-    return lambda frame: Labels(*foreground.label(frame.images))
+    return lambda frame: Labels(*foreground.label(frame.images, frame.halved))
 
 
 def _against_scene(task: Task, clips: Sequence[NDArray[np.uint8]]) -> Labeller:
@@ -171,7 +171,7 @@ def _against_scene(task: Task, clips: Sequence[NDArray[np.uint8]]) -> Labeller:
     names, scenes = task.setup.rig.names, [clip[0].copy() for clip in clips]
 
     def label(frame: FrameSet) -> Labels:
-        labels = Labels(*foreground.label(frame.images))
+        labels = Labels(*foreground.label(frame.images, frame.halved))
         if scenes:
             exchanged = exchanged_scenes(scenes, frame.images, labels.masks)
             scenes.clear()

@@ -329,7 +329,7 @@ class ContourFinder:
         """
         body = self.body
         arrays, free = (limb.arrays, limb.dofs) if limb else (body.arrays, None)
-        regions = None if images is None else self.colors.regions(images)
+        regions = None if images is None else self.colors.regions(images, self.views.rig.frame_shape)
         return gauss_newton.minimise(
             lambda states, scale, steps: descend(
                 arrays, self.views.at(pyramid, scale), states, self.line_search, steps, regions

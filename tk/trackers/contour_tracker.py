@@ -37,7 +37,7 @@ class ContourTracker(ContourFinder, Stateful[S], ABC):
     """
 
     objective_kind = "E_S"
-    needs_images = False
+    image_step = 0
     can_exclude_cameras = True
     reports_sigma = False
     has_segments = True

@@ -34,7 +34,7 @@ class Frame:
 
     Attributes:
         index: number of the frame in its source.
-        images: (C, H, W, 3) uint8 BGR.
+        images: (C, h, w, 3) uint8 BGR: of the masks' size, or reduced; see :attr:`Tracker.image_step`.
         masks: (C, H, W) uint8, 255 where the subject is, :data:`~tk.kernels.mask_values.OTHERS` where another person
             is who may hide the subject, else 0. A body part on another person costs nothing.
         uncertain: (C, H, W) bool, pixels whose mask is 0 although they may show the subject: a shadow, or clothes of
@@ -136,7 +136,8 @@ class Tracker(Protocol):
         stages, timing_stages: names of the entries of ``Estimate.iterations``, and of ``Estimate.timing``.
         pose_names, pose_units: (D,) names and units of the entries of the pose vector.
         objective_kind: meaning of ``Estimate.objective``.
-        needs_images: whether it looks at images, or at masks alone.
+        image_step: pixels of the cameras along an edge of a pixel of the images that it looks at, 1 or 2; 0: it looks
+            at masks alone.
         can_exclude_cameras: whether an empty mask excludes its camera. In a visual hull it would remove the subject.
         reports_sigma: whether estimates have sigma and residual.
         has_segments: whether segments, feet, joint angles and a smoothed copy are derived from its poses.
@@ -152,7 +153,7 @@ class Tracker(Protocol):
     pose_names: tuple[str, ...]
     pose_units: tuple[str, ...]
     objective_kind: str
-    needs_images: bool
+    image_step: int
     can_exclude_cameras: bool
     reports_sigma: bool
     has_segments: bool

@@ -40,6 +40,7 @@ from tk.model.cues.visible_contours import contour_shares
 from tk.model.masks.mosaic import doubled
 from tk.model.masks.regions import SQUARE3
 from tk.model.masks.silhouettes import Pyramid
+from tk.model.reduced_images import crop
 from tk.model.setup import Setup, Subject
 from tk.optim.gauss_newton import GaussNewtonSettings
 from tk.optim.quadratic import Quadratic
@@ -150,7 +151,7 @@ class RegionTracker(ContourTracker[RegionState]):
     method = "region"
     stages: tuple[str, ...] = ("contours", "search")
     timing_stages: tuple[str, ...] = ("masks_clean", "optimise", "check", "search")
-    needs_images = True
+    image_step = 2
     reports_sigma = True
     has_second_pass = True
 
@@ -341,7 +342,8 @@ class RegionTracker(ContourTracker[RegionState]):
                 for rays in (np.flatnonzero(person[c].any(axis=axis)) for axis in (1, 0))
             )
             # a quarter of the pixels shows objects of this size
-            odd_pixels = foreign[color_bins(frame.images[c][box][::2, ::2])] & (masks[c][box][::2, ::2] >= PERSON)
+            coarse = crop(frame.images[c], masks.shape[1:], *box)[::2, ::2]
+            odd_pixels = foreign[color_bins(coarse)] & (masks[c][box][::2, ::2] >= PERSON)
             opened = np.asarray(cv2.morphologyEx(odd_pixels.view(np.uint8), cv2.MORPH_OPEN, SQUARE3), np.uint8)
             if not opened.any():
                 continue
@@ -458,7 +460,7 @@ class RegionTracker(ContourTracker[RegionState]):
         """Return how the best pose explains the frame."""
         best = self._best.pose[None]
         _, met = seen.evidence.cast(self.body, best)
-        regions = None if seen.images is None else self.colors.regions(seen.images)
+        regions = None if seen.images is None else self.colors.regions(seen.images, self.views.rig.frame_shape)
         here = normal_equations(self.body.arrays, self.views.at(seen.pyramid, 0), best, self.line_search, regions)
         return _Look(met.label[0], here.hessian[0], seen.evidence.residual(met.label[0]))
 

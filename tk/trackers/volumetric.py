@@ -99,7 +99,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
     stages: tuple[str, ...] = ("all", *CHAINS)
     timing_stages: tuple[str, ...] = ("hull", "surface", "colour", "optimise", "update")
     objective_kind = "robust distance of surface points"
-    needs_images = True
+    image_step = 1
     can_exclude_cameras = False
     reports_sigma = False
     has_segments = False

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import av
+import cv2
 import numpy as np
 import pytest
 
@@ -21,7 +22,7 @@ from tk.errors import VideoError
 from tk.io.captures.clip import Clip, Image
 from tk.io.captures.clip_folder import list_clips, probe
 from tk.io.captures.frames import FrameReader
-from tk.io.captures.video import damaged_images, probe_video
+from tk.io.captures.video import VideoClip, damaged_images, probe_video
 
 
 @pytest.fixture(autouse=True)
@@ -144,29 +145,39 @@ def test_a_pixel_of_a_reduced_mask_shows_the_person_if_half_of_its_square_does(t
     np.testing.assert_array_equal(mask, [[0, 255, 255]])
 
 
-def encode(path: Path, images: list[np.ndarray], pixels: str = "yuv420p", full_range: bool = False) -> None:
-    """Write an H.264 video without visible loss."""
+def encode(
+    path: Path, images: list[np.ndarray], pixels: str = "yuv420p", full_range: bool = False, bt709: bool = False
+) -> None:
+    """Write an H.264 video without visible loss; its colours are those of BT.601, or of BT.709."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=15, options={"crf": "4"})
         stream.height, stream.width = images[0].shape[:2]
         stream.pix_fmt = pixels
         stream.codec_context.color_range = 2 if full_range else 1
+        stream.codec_context.colorspace = 1 if bt709 else 5
+        matrix = "ITU709" if bt709 else "ITU601"
         for image in images:
             frame = av.VideoFrame.from_ndarray(image, format="bgr24")
-            container.mux(stream.encode(frame.reformat(format=pixels, dst_color_range=2 if full_range else 1)))
+            planes = frame.reformat(format=pixels, dst_colorspace=matrix, dst_color_range=2 if full_range else 1)
+            container.mux(stream.encode(planes))
         container.mux(stream.encode())
 
 
-def turn_upside_down(path: Path, size: tuple[int, int]) -> None:
-    """Change the header of an MP4 file so that players turn the images by 180 degrees."""
+def turn(path: Path, size: tuple[int, int], quarters: int) -> None:
+    """Change the header of an MP4 file so that players turn the images clockwise."""
     one, minus = 1 << 16, (1 << 32) - (1 << 16)
     before = struct.pack(">9I", one, 0, 0, 0, one, 0, 0, 0, 1 << 30)
-    after = struct.pack(">9I", minus, 0, 0, 0, minus, 0, size[0] << 16, size[1] << 16, 1 << 30)
+    numbers = {
+        1: (0, one, 0, minus, 0, 0, size[1] << 16, 0),
+        2: (minus, 0, 0, 0, minus, 0, size[0] << 16, size[1] << 16),
+    }
     head, track, rest = path.read_bytes().partition(b"tkhd")
-    path.write_bytes(head + track + rest.replace(before, after, 1))
+    path.write_bytes(head + track + rest.replace(before, struct.pack(">9I", *numbers[quarters], 1 << 30), 1))
 
 
-@pytest.mark.parametrize("kind", ["usual", "full range", "upside down", "colours at full size", "not divisible"])
+@pytest.mark.parametrize(
+    "kind", ["usual", "full range", "a quarter", "a half", "colours at full size", "not divisible"]
+)
 def test_a_reduced_video_equals_the_reduced_images_of_the_video(tmp_path: Path, kind: str) -> None:
     width, height = (94, 66) if kind == "not divisible" else (96, 64)
     y, x = np.mgrid[:height, :width]
@@ -176,18 +187,41 @@ def test_a_reduced_video_equals_the_reduced_images_of_the_video(tmp_path: Path, 
     ]
     path = tmp_path / "a.mp4"
     encode(path, images, "yuv444p" if kind == "colours at full size" else "yuv420p", kind == "full range")
-    if kind == "upside down":
-        turn_upside_down(path, (width, height))
-        images = [image[::-1, ::-1] for image in images]
+    quarters = {"a quarter": 1, "a half": 2}.get(kind, 0)
+    if quarters:
+        turn(path, (width, height), quarters)
+        images = [np.rot90(image, -quarters) for image in images]
     clip = probe(path)
     small = clip.reduced(2)
-    assert (small.width, small.height) == (width // 2, height // 2)
+    assert (small.height, small.width) == (images[0].shape[0] // 2, images[0].shape[1] // 2)
+    assert isinstance(small, VideoClip) and small.by_planes
     found = read_all(small, start=1)
     for image, whole, read in zip(images[1:], read_all(clip, start=1), found, strict=True):
         assert np.abs(whole.astype(int) - image).mean() < 3
         squares = whole[: 2 * small.height, : 2 * small.width].reshape(small.height, 2, small.width, 2, 3)
         # the colours of neighbours mix, and OpenCV and FFmpeg round differently
         assert np.abs(read - squares.mean(axis=(1, 3))).mean() < 3
+
+
+@pytest.mark.parametrize("factor", [2, 3, 4, 6])
+@pytest.mark.parametrize("pixels", ["yuv420p", "yuv422p", "yuv444p", "yuv420p10le"])
+@pytest.mark.parametrize("full_range", [False, True])
+@pytest.mark.parametrize("bt709", [False, True])
+def test_the_planes_of_every_coding_give_the_colors_that_ffmpeg_gives(
+    tmp_path: Path, factor: int, pixels: str, full_range: bool, bt709: bool
+) -> None:
+    """Patches of all hues, of which BT.601's colours would differ by 9 levels from BT.709's."""
+    patches = np.random.default_rng(0).integers(30, 226, (4, 6, 3), np.uint8)
+    image = cv2.resize(patches, (144, 96), interpolation=cv2.INTER_CUBIC)
+    encode(tmp_path / "a.mp4", [image], pixels, full_range, bt709)
+    small = probe(tmp_path / "a.mp4").reduced(factor)
+    assert isinstance(small, VideoClip) and small.by_planes
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        whole = next(container.decode(video=0)).to_ndarray(format="bgr24")
+    expected = cv2.resize(whole, (small.width, small.height), interpolation=cv2.INTER_AREA)
+    difference = np.abs(read_all(small)[0].astype(int) - expected)
+    # FFmpeg interpolates the colours of 10 bits between their places
+    assert difference.mean() < (3 if pixels.endswith("10le") else 2)
 
 
 @pytest.mark.parametrize("end", [0.7, 0.9])

@@ -47,7 +47,7 @@ def test_bins_have_sixteen_levels_of_each_channel(b, g, r):
 def test_likelihoods_are_uniform_before_learning():
     colors = PartColors(BODY)
     assert not colors.known and colors.state.counts is None
-    assert colors.regions(np.zeros((2, 4, 4, 3), np.uint8)) is None
+    assert colors.regions(np.zeros((2, 4, 4, 3), np.uint8), (8, 8)) is None
     assert colors.mismatch.shape == (COLOR_BINS, len(COLOR_GROUPS)) and not colors.mismatch.any()
 
 
@@ -72,8 +72,8 @@ def test_likelihoods_are_shares_and_nothing_is_impossible():
     learned = [COLOR_GROUPS.index(name) for name in ("torso", "forearm", "thigh", "head", "calf")]
     np.testing.assert_allclose(share[learned].sum(axis=1), 1, rtol=1e-3)
     assert (share > 0).all()
-    regions = colors.regions(np.zeros((2, 4, 4, 3), np.uint8))
-    assert regions is not None and 0 < regions.weight <= 1
+    regions = colors.regions(np.zeros((2, 4, 4, 3), np.uint8), (8, 8))
+    assert regions is not None and 0 < regions.weight <= 1 and regions.step == 2
     np.testing.assert_array_equal(regions.log_likelihood, colors.log_likelihood)
 
 

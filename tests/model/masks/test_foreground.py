@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from tests.conftest import development_capture
 from tk.errors import CaptureError
-from tk.model.masks.background import median_plate
+from tk.model.masks.background import median_plate, reduced
 from tk.model.masks.foreground import CollinearityForeground
 from tk.model.masks.regions import clean_by_area
 
@@ -72,6 +72,13 @@ def test_the_mask_holds_the_person_and_not_the_shadow(noise, color):
     assert masks.shape == (2, *SHAPE) and masks.dtype == np.uint8 and set(np.unique(masks)) == {0, 255}
     for c in range(2):
         assert iou(masks[c], truth[c]) > 0.93
+
+
+def test_images_that_are_reduced_already_give_the_same_masks(learned):
+    scene, _, foreground = learned
+    images = expose(with_person(scene, (40, 40, 200))[0], np.random.default_rng(3))
+    for ours, theirs in zip(foreground.label(images), foreground.label(images, reduced(images, 2)), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
 
 
 def test_clothes_of_the_walls_colour_leave_no_hole(learned):

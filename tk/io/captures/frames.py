@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import threading
 import weakref
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.io.captures.clip import Clip, Image, Reader
+from tk.model.masks.background import reduced
 
 #: most frames decoded ahead, and most bytes of them. Fewer make the consumer wait for a slow image.
 _AHEAD = 8
@@ -38,6 +40,11 @@ class FrameSet:
     time: float
     images: NDArray[np.uint8]
     masks: NDArray[np.uint8] | None
+
+    @functools.cached_property
+    def halved(self) -> NDArray[np.uint8]:
+        """(C, H // 2, W // 2, 3) the images reduced by two: each pixel is the mean of a square."""
+        return reduced(self.images, 2)
 
 
 class FrameReader(Iterator[FrameSet]):

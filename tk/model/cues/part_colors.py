@@ -112,11 +112,13 @@ class PartColors(Stateful[LearnedColors]):
         self.mismatch = np.ascontiguousarray(np.minimum(deficit, 1.0).T)
         self.foreign = outside + _ANYTHING * total[-1] / COLOR_BINS > rows[-1]
 
-    def regions(self, images: NDArray[np.uint8]) -> Regions | None:
-        """Return the colour cue of images (V, H, W, 3) for the contours; None before any colours are learned."""
-        if self.log_likelihood is None:
+    def regions(self, images: NDArray[np.uint8], size: tuple[int, int]) -> Regions | None:
+        """Return the colour cue of images (V, h, w, 3), reduced or not, of cameras of a ``size`` (H, W), for the
+        contours; None without images, and before any colours are learned."""
+        if self.log_likelihood is None or not images.size:
             return None
-        return Regions(np.ascontiguousarray(images), self.log_likelihood, _CONTOUR_WEIGHT)
+        step = size[0] // images.shape[1]
+        return Regions(np.ascontiguousarray(images), self.log_likelihood, _CONTOUR_WEIGHT, step)
 
     def likeness(self, bins: NDArray[np.int32]) -> float:
         """Return the mean log-likelihood of colours (N,), relative to that of the learned colours: about 0 if they are

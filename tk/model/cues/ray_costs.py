@@ -22,6 +22,7 @@ from tk.model.body.cone_body import COLOR_GROUPS, ConeBody
 from tk.model.cameras.camera import Rig
 from tk.model.cues.cue import Cue
 from tk.model.cues.part_colors import PartColors, color_bins
+from tk.model.reduced_images import every
 
 Float = NDArray[np.float64]
 
@@ -68,9 +69,9 @@ class RayGrid:
         self.packed = Rays(pack_cameras(rig).astype(np.float32), self.step, self.rays)
 
     def sample(self, images: NDArray) -> NDArray:
-        """Return the grid's pixels (V, h, w, ...) of images (V, H, W, ...)."""
-        offset = self.step // 2
-        return images[:, offset :: self.step, offset :: self.step]
+        """Return the grid's pixels (V, h, w, ...) of masks (V, H, W), or of images (V, H, W, ...), which may be
+        reduced."""
+        return every(images, self.rig.frame_shape, self.step)
 
     def render(self, body: ConeBody, poses: Float) -> Cast:
         """Return the parts of the body that the rays meet at poses (B, D): labels and depths (B, V, h, w)."""

@@ -124,8 +124,8 @@ AREA_MIN = 2e-4
 class Foreground(Protocol):
     """A segmentation method."""
 
-    def label(self, images: Images) -> tuple[Images, NDArray[np.bool_]]:
-        """Segment images (C, H, W, 3) uint8 BGR.
+    def label(self, images: Images, halved: Images | None = None) -> tuple[Images, NDArray[np.bool_]]:
+        """Segment images (C, H, W, 3) uint8 BGR; ``halved``: the same reduced by two, if they are there.
 
         Returns:
             Masks (C, H, W) uint8, 0 or 255; and uncertain pixels (C, H, W) bool: pixels of mask 0 that may be a shadow
@@ -243,15 +243,24 @@ class CollinearityForeground:
         return cls(scene.plates, relative, np.asarray(sizes, dtype=int), config or ForegroundSettings(), floor, scene)
 
     def label(
-        self, images: Images, prior: tuple[Images, NDArray[np.bool_]] | None = None
+        self,
+        images: Images,
+        halved: Images | None = None,
+        prior: tuple[Images, NDArray[np.bool_]] | None = None,
     ) -> tuple[Images, NDArray[np.bool_]]:
         """Segment images; see :meth:`Foreground.label`. Pixels are uncertain only inside the person's box.
 
-        ``prior``: masks (C, H, W) and uncertain pixels (C, H, W), taken over where a learned scene is unknown.
+        Args:
+            images: (C, H, W, 3).
+            halved: the same reduced by two, if they are there.
+            prior: masks (C, H, W) and uncertain pixels (C, H, W), taken over where a learned scene is unknown.
         """
         masks = np.zeros(images.shape[:3], np.uint8)
         uncertain = np.zeros(images.shape[:3], np.bool_)
-        reduced(images, _REDUCTION, out=self._small)
+        if halved is None:
+            reduced(images, _REDUCTION, out=self._small)
+        else:
+            self._small[...] = halved
         scene = self._scene
         gains, variances = gain_and_noise(samples(self._small), scene.samples, self._noise_samples)
         if (noisy := variances > _NOISY).any():

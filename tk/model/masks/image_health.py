@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tk.kernels.mask_values import PERSON
 from tk.model.masks.image_shift import ImageShift, ShiftState
+from tk.model.reduced_images import every
 from tk.model.stateful import Stateful
 
 # Rows of an image that are compared, approximately.
@@ -107,16 +108,16 @@ class ImageHealth(Stateful[HealthState]):
         """Return for each camera its fault, one of :data:`IMAGE_FAULTS`, or None.
 
         Args:
-            images: (C, H, W, 3) BGR; if it is empty, frozen cameras are found from the masks alone.
+            images: (C, h, w, 3) BGR, of the masks' size or reduced; if it is empty, frozen cameras are found from the
+                masks alone.
             masks: (C, H, W), 128 and more where the person is.
             doubtful: (C,) cameras whose mask may not show the person; None: none.
         """
         C = len(masks)
-        step = max(1, masks.shape[1] // _ROWS)
-        small = masks[:, step // 2 :: step, step // 2 :: step] >= PERSON
+        small = _thinned(masks, masks) >= PERSON
         given = images.size > 0
         # the green channel suffices
-        shown = images[:, step // 2 :: step, step // 2 :: step, 1].copy() if given else small * np.uint8(255)
+        shown = _thinned(images[..., 1], masks).copy() if given else small * np.uint8(255)
         self.moved = moved = self._shift.look(images, masks, doubtful) if given else np.full(C, np.nan)
         look = _Look(shown, small, moved, given)
         faulty = {name: measure(self, look) for name, (_, measure) in IMAGE_FAULTS.items()}
@@ -158,10 +159,14 @@ IMAGE_FAULTS: Mapping[str, tuple[str, Callable[[ImageHealth, _Look], NDArray[np.
 
 
 def sampled(images: NDArray[np.uint8], masks: NDArray[np.uint8]) -> Sampled:
-    """Return what :func:`contradiction` needs of a frame: images (C, H, W, 3) and masks (C, H, W)."""
-    step = max(1, masks.shape[1] // _ROWS)
-    grid = np.s_[:, step // 2 :: step, step // 2 :: step]
-    return images[grid].astype(np.int16), masks[grid] >= PERSON
+    """Return what :func:`contradiction` needs of a frame: images (C, h, w, 3), of the masks' size or reduced, and masks
+    (C, H, W)."""
+    return _thinned(images, masks).astype(np.int16), _thinned(masks, masks) >= PERSON
+
+
+def _thinned(images: NDArray[np.uint8], masks: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return images (C, h, w, ...) at every some pixels of the masks (C, H, W)."""
+    return every(images, masks.shape[1:], max(1, masks.shape[1] // _ROWS))
 
 
 def contradiction(pairs: Iterable[tuple[Sampled, Sampled]]) -> str | None:
