@@ -154,6 +154,7 @@ def memory_behind(array: np.ndarray) -> int:
 # --- stopped and taken up again ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("system")
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs POSIX signals")
 def test_a_killed_causal_run_is_resumed_and_equals_an_uninterrupted_one(
     tk: Tk, quick: Path, tiny: Path, causal: Path, tmp_path: Path
