@@ -134,13 +134,15 @@ Tk = Callable[..., Ran]
 
 
 @pytest.fixture
-def tk(capfd: pytest.CaptureFixture[str]) -> Tk:
+def tk(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Tk:
     """Return a function that runs a command in this process: ``tk("track", capture, "-o", result)``.
 
-    Output of C libraries is captured, too. `tk track` writes neither video nor report unless ``pictures`` is set, to
-    save time.
+    Output of C libraries is captured, too. To save time, `tk track` writes neither video nor report unless ``pictures``
+    is set, and starts no process before it knows whether it needs one.
     """
     from tk.cli import main
+
+    monkeypatch.setattr("tk.run.worker.cores", lambda: 1)
 
     def run(*arguments: Any, pictures: bool = False) -> Ran:
         if arguments[:1] == ("track",) and not pictures:
@@ -226,6 +228,19 @@ def causal(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert track(open_capture(tiny), path, settings_file.from_toml(QUICK), causal=True).lost == 0
 
     return made_once(tmp_path_factory, "causal.h5", make)
+
+
+@pytest.fixture(scope="session")
+def refined(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same with the second pass, which has nothing to report."""
+    from tk.io.captures.capture import open_capture
+
+    def make(path: Path) -> None:
+        reporter = Silent()
+        assert track(open_capture(tiny), path, settings_file.from_toml(QUICK), reporter).lost == 0
+        assert reporter.notes == []
+
+    return made_once(tmp_path_factory, "refined.h5", make)
 
 
 @pytest.fixture(scope="session")

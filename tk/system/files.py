@@ -27,7 +27,7 @@ if LINUX:
 LOCK = ".lock"
 
 #: seconds for which a file that another program reads is waited for
-_BUSY_S = 5.0
+BUSY_S = 5.0
 _RETRY_S = 0.05
 #: flags of a file whose name goes with its last user; O_TEMPORARY is known to Windows only
 _OPEN = os.O_RDWR | getattr(os, "O_BINARY", 0) | getattr(os, "O_TEMPORARY", 0)
@@ -168,13 +168,13 @@ def _sqlite_lock(folder: Path, busy: Exception) -> Iterator[None]:
             file.unlink()
 
 
-def replace(source: Path, target: Path) -> None:
-    """Give a closed file the name of another one, which goes; wait a moment for a program that has it open.
+def replace(source: Path, target: Path, patience_s: float = BUSY_S) -> None:
+    """Give a closed file the name of another one, which goes; wait for a program that has it open.
 
     Raises:
         OSError: the system refuses.
     """
-    deadline = time.monotonic() + _BUSY_S
+    deadline = time.monotonic() + patience_s
     while True:
         try:
             return os.replace(source, target)
