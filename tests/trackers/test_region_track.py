@@ -174,23 +174,6 @@ def test_a_killed_causal_run_is_resumed_and_equals_an_uninterrupted_one(
     assert_same(result, causal, slice(0, frames))
 
 
-def test_an_interrupted_run_gets_its_second_pass_when_complete(tiny: Path, refined: Path, tmp_path: Path) -> None:
-    """The first pass in two runs, the second over frames of both: masks of the earlier run are read again."""
-
-    class Stop(Silent):
-        def advance(self, index: int, estimate: object) -> None:
-            super().advance(index, estimate)
-            if index == 7:
-                signal.raise_signal(signal.SIGINT)
-
-    result = tmp_path / "r.h5"
-    config = replace(CONFIG, ahead=2)
-    summary = track(open_capture(tiny), result, config, Stop())
-    assert summary.interrupted and REFINED not in read_result(result).model
-    assert not track(open_capture(tiny), result, config, resume=True).interrupted
-    assert_same(result, refined)
-
-
 def test_a_run_killed_in_its_second_pass_repeats_it_on_resume(
     tiny: Path, causal: Path, refined: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
