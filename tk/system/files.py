@@ -9,11 +9,9 @@ import contextlib
 import mmap
 import os
 import shutil
-import sqlite3
 import tempfile
 import threading
 import time
-import uuid
 import weakref
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -52,7 +50,7 @@ class NamelessFile:
     def in_folder(folder: str | os.PathLike[str]) -> NamelessFile:
         """Return a new, empty file on the disk of a folder; OSError if there can be none."""
         if portable():
-            path = Path(folder, f".tk-{uuid.uuid4().hex}")
+            path = Path(folder, f".tk-{os.urandom(16).hex()}")
             return NamelessFile(os.open(path, _OPEN | os.O_CREAT | os.O_EXCL, 0o600), path)
         with tempfile.TemporaryFile(dir=folder) as file:
             return NamelessFile(os.dup(file.fileno()))
@@ -150,6 +148,8 @@ def _folder_lock(folder: Path, busy: Exception) -> Iterator[None]:
 @contextlib.contextmanager
 def _sqlite_lock(folder: Path, busy: Exception) -> Iterator[None]:
     """Lock a file in the folder by an empty transaction: only SQLite's locks are in Python on all systems."""
+    import sqlite3  # 5 ms, which Linux need not spend
+
     file = folder / LOCK
     lock = sqlite3.connect(file, timeout=0, isolation_level=None, check_same_thread=False)
     try:
