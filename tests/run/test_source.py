@@ -34,7 +34,7 @@ from tk.run.task import Choice, Task, TrackOptions
 from tk.trackers.protocol import Frame
 from tk.trackers.region import RegionTracker
 
-SETTINGS = settings_file.from_toml(QUICK)
+SETTINGS = settings_file.from_toml(QUICK.replace("init_frames = 3", "init_frames = 1"))
 RIG = ring_of_cameras(3, width=160, height=200)
 POSES = walk(5)
 SETUP = Setup(RIG, Volume((0.0, 0.0, 1.0), (3.0, 3.0, 2.2)), "z", 15.0, (Subject(STATURE, body=BODY),))
