@@ -5,7 +5,7 @@ Workers of pytest-xdist (`-n 2`) share the expensive fixtures, which one of them
 
 from __future__ import annotations
 
-import fcntl
+import contextlib
 import os
 import re
 import shutil
@@ -28,6 +28,9 @@ from tk.io.captures.film import Film
 from tk.run.reporter import Reporter
 from tk.run.task import RecordingOptions
 from tk.settings import Settings
+from tk.system import LINUX
+from tk.system.files import locked
+from tk.system.machine import cores
 
 if TYPE_CHECKING:
     from tk.run.session import Summary
@@ -38,8 +41,7 @@ hypothesis.settings.register_profile("same", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("same")
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # set before any kernel runs; results do not depend on the number of threads
-    _cores = len(os.sched_getaffinity(0))
-    os.environ.setdefault("TK_THREADS", str(max(_cores // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]), 1)))
+    os.environ.setdefault("TK_THREADS", str(max(cores() // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]), 1)))
 
 # a shell that starts the tests in the background makes them ignore Ctrl-C, and their child processes, too
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -132,13 +134,15 @@ Tk = Callable[..., Ran]
 
 
 @pytest.fixture
-def tk(capfd: pytest.CaptureFixture[str]) -> Tk:
+def tk(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Tk:
     """Return a function that runs a command in this process: ``tk("track", capture, "-o", result)``.
 
-    Output of C libraries is captured, too. `tk track` writes neither video nor report unless ``pictures`` is set, to
-    save time.
+    Output of C libraries is captured, too. To save time, `tk track` writes neither video nor report unless ``pictures``
+    is set, and starts no process before it knows whether it needs one.
     """
     from tk.cli import main
+
+    monkeypatch.setattr("tk.run.worker.cores", lambda: 1)
 
     def run(*arguments: Any, pictures: bool = False) -> Ran:
         if arguments[:1] == ("track",) and not pictures:
@@ -167,14 +171,16 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
     root = factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         root = root.parent
-    (root / "shared").mkdir(exist_ok=True)
-    path, done = root / "shared" / name, root / "shared" / f".{name}.done"
-    with (root / "shared" / f".{name}.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # released when the process ends, however it ends
-        if not done.exists():
-            make(path)
-            done.touch()
-    return path
+    path, lock, done = root / "shared" / name, root / "locks" / name, root / "locks" / f"{name}.done"
+    path.parent.mkdir(exist_ok=True)
+    lock.mkdir(parents=True, exist_ok=True)
+    while True:
+        with contextlib.suppress(BlockingIOError), locked(lock, BlockingIOError()):
+            if not done.exists():
+                make(path)
+                done.touch()
+            return path
+        time.sleep(0.05)
 
 
 @pytest.fixture(scope="session")
@@ -185,6 +191,15 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_capture(plan_capture(Options(frames=FRAMES, cameras=4, size=(160, 120), seed=3)), folder, masks=True)
 
     return made_once(tmp_path_factory, "tiny", make)
+
+
+@pytest.fixture(params=["Linux", "portable"])
+def system(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Use first what Linux has, then only what all systems have."""
+    if request.param == "Linux" and not LINUX:
+        pytest.skip("this system has the portable way only")
+    monkeypatch.setenv("TK_PORTABLE", str(int(request.param == "portable")))
+    return str(request.param)
 
 
 @pytest.fixture
@@ -213,6 +228,19 @@ def causal(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert track(open_capture(tiny), path, settings_file.from_toml(QUICK), causal=True).lost == 0
 
     return made_once(tmp_path_factory, "causal.h5", make)
+
+
+@pytest.fixture(scope="session")
+def refined(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same with the second pass, which has nothing to report."""
+    from tk.io.captures.capture import open_capture
+
+    def make(path: Path) -> None:
+        reporter = Silent()
+        assert track(open_capture(tiny), path, settings_file.from_toml(QUICK), reporter).lost == 0
+        assert reporter.notes == []
+
+    return made_once(tmp_path_factory, "refined.h5", make)
 
 
 @pytest.fixture(scope="session")

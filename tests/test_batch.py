@@ -30,6 +30,7 @@ from tk.io.hdf5_writer import Hdf5Writer
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.skeleton import JOINTS, build_skeleton
 from tk.run.task import RecordingOptions
+from tk.system.files import locked
 
 ROOT = Path(__file__).parents[1]
 CONFIG = settings_file.from_toml(QUICK)
@@ -224,13 +225,10 @@ def test_error_without_offsets_is_not_given_for_a_still_person(tmp_path: Path) -
 
 
 def test_two_batches_in_one_folder_are_refused(tk: Tk, tiny: Path, tmp_path: Path) -> None:
-    import fcntl
-
-    (tmp_path / "out" / "jobs").mkdir(parents=True)
-    handle = os.open(tmp_path / "out" / "jobs", os.O_RDONLY)
-    fcntl.flock(handle, fcntl.LOCK_EX)
-    tk("batch", tiny, "-o", tmp_path / "out").complaint("another tk batch uses it")
-    os.close(handle)
+    jobs = tmp_path / "out" / "jobs"
+    jobs.mkdir(parents=True)
+    with locked(jobs, AssertionError("in use")):
+        tk("batch", tiny, "-o", tmp_path / "out").complaint("another tk batch uses it")
 
 
 def test_result_that_another_run_writes_is_busy(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Each example runs on the demo capture with short settings and gives the output that it promises."""
+"""Each example runs with short settings, on the demo or a smaller capture, and gives the output that it promises."""
 
 from __future__ import annotations
 
@@ -21,11 +21,17 @@ OPTIONS = {
 @pytest.mark.filterwarnings("default")  # warnings of other packages do not fail the test
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
 def test_example_runs(
-    example: Path, quick: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    example: Path,
+    quick: Path,
+    tiny: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     settings = ["--config", str(quick)] if "--config" in example.read_text(encoding="utf-8") else []
-    monkeypatch.setattr(sys, "argv", [example.name, *OPTIONS[example.stem], *settings])
+    capture = [str(tiny)] if example.stem.startswith(("01", "02")) else []
+    monkeypatch.setattr(sys, "argv", [example.name, *OPTIONS[example.stem], *settings, *capture])
     runpy.run_path(str(example), run_name="__main__")
     said = capfd.readouterr().out
     if example.stem.startswith("01"):

@@ -78,6 +78,59 @@ def test_no_module_imports_itself_through_others() -> None:
         visit(name, ())
 
 
+#: modules, and attributes of ``os`` and ``sys``, that some systems lack; all that may be used outside of tk.system
+NOT_EVERYWHERE = {
+    "curses", "fcntl", "grp", "msvcrt", "posix", "pty", "pwd", "resource", "select", "selectors", "signal", "syslog",
+    "termios", "tty", "winreg",
+}  # fmt: skip
+OF_OS = {
+    "PathLike", "SEEK_END", "W_OK", "X_OK", "access", "close", "cpu_count", "devnull", "dup", "dup2", "environ",
+    "fsencode", "fspath", "fstat", "fsync", "getpid", "path", "replace", "stat", "strerror", "unlink", "urandom",
+    "utime", "walk",
+}  # fmt: skip
+#: attributes and arguments of other modules
+ELSEWHERE = {
+    "AF_UNIX", "MADV_REMOVE", "chmod", "get_context", "hardlink_to", "pass_fds", "preexec_fn", "recv_fds", "send_fds",
+    "socketpair", "start_new_session", "symlink_to",
+}  # fmt: skip
+PLACES = ("/dev/", "/proc/", "/run/", "/sys/", "/tmp/", "/var/", "C:")
+
+
+def of_some_systems(tree: ast.AST) -> Iterator[str]:
+    """Yield what a module names that does not exist on Linux, Windows and macOS alike."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in NOT_EVERYWHERE)
+        elif isinstance(node, ast.ImportFrom) and node.module in {*NOT_EVERYWHERE, "os"}:
+            yield f"from {node.module}"
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            name, owner = node.attr, node.value.id
+            if (owner == "os" and name not in OF_OS) or (owner, name) in (("sys", "platform"), ("platform", "system")):
+                yield f"{owner}.{name}"
+        if isinstance(node, ast.Attribute) and node.attr in ELSEWHERE:
+            yield node.attr
+        elif isinstance(node, ast.keyword) and node.arg in ELSEWHERE:
+            yield node.arg
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith(PLACES):
+            yield node.value
+
+
+def test_only_one_package_uses_what_some_systems_lack() -> None:
+    found = {
+        f"{name}: {used}"
+        for name, file in FILES.items()
+        if member(name) != "system"
+        for used in of_some_systems(ast.parse(file.read_text(encoding="utf-8")))
+    }
+    assert not found
+
+
+def test_what_some_systems_lack_is_found() -> None:
+    code = "import fcntl\nfrom os import link\nos.getuid()\nPopen(pass_fds=())\nopen('/proc/meminfo')\nsys.platform"
+    assert len(list(of_some_systems(ast.parse(code)))) == 6
+    assert not list(of_some_systems(ast.parse("import socket, mmap\nos.replace(a, b)\nPath.unlink(c)")))
+
+
 def test_a_run_imports_no_part_of_scipy_before_its_first_use() -> None:
     """SciPy would take as long to import as all of tk."""
     code = (

@@ -129,11 +129,11 @@ def descend(scene: Scene, start: Float, seed: int, shuffle: bool) -> tuple[Float
     return np.degrees(path[:, scene.two]), int(found.iterations[0])
 
 
-def run(options: Options) -> str:
-    """Write the figure and give the table."""
+def run(options: Options, step_deg: float = STEP_DEG) -> str:
+    """Write the figure, whose points lie ``step_deg`` apart, and give the table."""
     paper = settings_file.preset("kehl2006")
     scene = look(options, paper)
-    axis = np.arange(-WIDTH_DEG, WIDTH_DEG + 0.1, STEP_DEG)
+    axis = np.arange(-WIDTH_DEG, WIDTH_DEG + 0.1, step_deg)
     grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
     poses = moved(scene, grid)
     mean = np.mean([landscape(scene, seed, poses) for seed in range(AVERAGED)], axis=0)

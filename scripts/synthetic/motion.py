@@ -9,6 +9,7 @@ on top.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -72,22 +73,19 @@ class Motion:
     root: Callable[[Float], Float] | None = None
     placed: bool = False
 
+    @functools.cached_property
+    def _curves(self) -> dict[str, Callable[[Float], Float]]:
+        """Functions that return each angle, degrees, at (T,) times in frames."""
+        points: dict[str, list[tuple[float, float]]] = {name: [] for name in LIMITS_DEG}
+        for at, values in self.keys:
+            for name, value in values.items():
+                points[name].append((at, value))
+        return {name: _curve(own) for name, own in points.items()}
+
     def angles(self, frame: Float) -> dict[str, Float]:
         """Radians of every angle at (T,) times in frames."""
         frame = np.asarray(frame, dtype=np.float64)
-        curves: dict[str, list[tuple[float, float]]] = {name: [] for name in LIMITS_DEG}
-        for at, values in self.keys:
-            for name, value in values.items():
-                curves[name].append((at, value))
-        result = {}
-        for name, points in curves.items():
-            if not points:
-                result[name] = np.zeros(len(frame))
-                continue
-            x, y = np.array(points).T
-            result[name] = (
-                np.full(len(frame), y[0]) if len(x) == 1 else PchipInterpolator(x, y)(np.clip(frame, x[0], x[-1]))
-            )
+        result = {name: curve(frame) for name, curve in self._curves.items()}
         sway = np.sin(2 * np.pi * frame / self.fps * 0.45)  # nobody stands quite still
         result["spine_side"] = result["spine_side"] + 0.6 * sway
         result["neck_turn"] = result["neck_turn"] + 1.5 * sway
@@ -117,6 +115,16 @@ class Motion:
             if frame >= start:
                 side = holder
         return side
+
+
+def _curve(points: Sequence[tuple[float, float]]) -> Callable[[Float], Float]:
+    """Return the curve through (time, value) points, constant before and after them; 0 without points."""
+    if len(points) < 2:
+        value = points[0][1] if points else 0.0
+        return lambda frame: np.full(len(frame), value)
+    x, y = np.array(points).T
+    cubics = PchipInterpolator(x, y)
+    return lambda frame: np.asarray(cubics(np.clip(frame, x[0], x[-1])))
 
 
 @dataclass(frozen=True)

@@ -28,13 +28,12 @@ def elsewhere(copy: Path) -> Path:
 
 
 def test_tracking_rendering_and_reports_equal_those_of_videos_in_the_folder(
-    tk: Tk, tiny: Path, elsewhere: Path, quick: Path, tmp_path: Path
+    tk: Tk, causal: Path, elsewhere: Path, quick: Path, tmp_path: Path
 ) -> None:
-    given, moved = tmp_path / "given.h5", tmp_path / "moved.h5"
-    assert tk("track", tiny, "-o", given, "--config", quick, "--frames", "0:3", "--causal").code == 0
+    moved = tmp_path / "moved.h5"
     ran = tk("track", elsewhere, "-o", moved, "--config", quick, "--frames", "0:3", "--causal")
     assert ran.code == 0, ran.err
-    apart = read_result(given).joints - read_result(moved).joints
+    apart = read_result(causal).joints[:3] - read_result(moved).joints
     assert np.abs(apart).max() < 0.01
     assert tk("render", moved, elsewhere, "-o", tmp_path / "o.mp4").code == 0
     assert tk("report", moved, elsewhere, "-o", tmp_path / "r.html").code == 0

@@ -59,13 +59,15 @@ def test_turned_camera_is_named(tk: Tk, copy: Path) -> None:
     assert np.argmax([c["pairs_px"] for c in found["cameras"]]) == 1
 
 
-def test_inspect_and_track_refuse_the_cameras_of_another_recording(tk: Tk, copy: Path, tmp_path: Path) -> None:
+def test_inspect_and_track_refuse_the_cameras_of_another_recording(
+    tk: Tk, quick: Path, copy: Path, tmp_path: Path
+) -> None:
     for camera, degrees in enumerate((8.0, -9.0, -8.0, 9.0)):
         turned(copy, camera, degrees)
     ran = tk("inspect", copy, "--json")
     (first, *_) = json.loads(ran.out)["findings"]
     assert first.startswith("the cameras cam1, cam2, cam3 and cam4 do not belong together")
-    tk("track", copy, "-o", tmp_path / "r.h5").complaint(first)
+    tk("track", copy, "-o", tmp_path / "r.h5", "--config", quick).complaint(first)
 
 
 def swap_first_two(folder: Path) -> None:
@@ -77,20 +79,20 @@ def swap_first_two(folder: Path) -> None:
 
 
 def test_inspect_and_track_refuse_videos_that_show_another_cameras_empty_scene(
-    tk: Tk, copy: Path, tmp_path: Path
+    tk: Tk, quick: Path, copy: Path, tmp_path: Path
 ) -> None:
     swap_first_two(copy / "videos")
     expected = "the video of cam1 shows the empty scene of cam2, the video of cam2 shows the empty scene of cam1"
-    for command in (["inspect", copy], ["track", copy, "-o", tmp_path / "r.h5"]):
+    for command in (["inspect", copy], ["track", copy, "-o", tmp_path / "r.h5", "--config", quick]):
         tk(*command, "--masks", "none").complaint(str(copy), expected)
 
 
-def test_inspect_and_track_name_swapped_videos(tk: Tk, copy: Path, tmp_path: Path) -> None:
+def test_inspect_and_track_name_swapped_videos(tk: Tk, quick: Path, copy: Path, tmp_path: Path) -> None:
     for folder in ("videos", "masks"):
         swap_first_two(copy / folder)
     ran = tk("inspect", copy, "--json")
     assert "the videos of cam1 and cam2 look swapped" in json.loads(ran.out)["findings"][0]
-    tk("track", copy, "-o", tmp_path / "r.h5").complaint("the videos of cam1 and cam2 look swapped")
+    tk("track", copy, "-o", tmp_path / "r.h5", "--config", quick).complaint("the videos of cam1 and cam2 look swapped")
 
 
 def test_inspect_and_track_refuse_masks_of_other_frames(tk: Tk, copy: Path, tmp_path: Path) -> None:

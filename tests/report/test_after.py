@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -40,6 +40,13 @@ def images_of(video: Path) -> np.ndarray:
         return np.array([image.to_ndarray(format="bgr24") for image in container.decode(video=0)], float)
 
 
+@pytest.fixture(scope="module")
+def filmed(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Film]:
+    """A result of frames 1 to 6, and its film. Not to be changed."""
+    result = tmp_path_factory.mktemp("film") / "r.h5"
+    return result, tracked_with_film(open_capture(tiny), result)
+
+
 def tracked_with_film(capture: Capture, result: Path, settings: str = QUICK) -> Film:
     """Track frames 1 to 6 causally; return the film."""
     film = film_for(capture, result)
@@ -73,9 +80,8 @@ def test_a_run_keeps_the_images_that_its_video_and_report_show(
     assert again.count('"jpeg":') == page.count('"jpeg":') > 0
 
 
-def test_a_resumed_run_has_a_whole_video(tiny: Path, tmp_path: Path) -> None:
-    capture, result = open_capture(tiny), tmp_path / "r.h5"
-    tracked_with_film(capture, result)
+def test_a_resumed_run_has_a_whole_video(tiny: Path, filmed: tuple[Path, Film], tmp_path: Path) -> None:
+    capture, result = open_capture(tiny), Path(shutil.copy(filmed[0], tmp_path))
     film = film_for(capture, result)
     track(capture, result, settings_file.from_toml(QUICK), film=film, frames=(1, 10), causal=True, resume=True)
     write_video_and_report(capture, result, pytest.fail, film)
@@ -83,7 +89,7 @@ def test_a_resumed_run_has_a_whole_video(tiny: Path, tmp_path: Path) -> None:
 
 
 def test_a_run_on_a_full_disk_has_a_whole_video(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "fstatvfs", lambda _: SimpleNamespace(f_bavail=0, f_frsize=4096))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
     capture, result, reporter = open_capture(tiny), tmp_path / "r.h5", Silent()
     film = film_for(capture, result)
     track(capture, result, settings_file.from_toml(QUICK), reporter, film=film, frames=(1, 7), causal=True)
@@ -92,9 +98,11 @@ def test_a_run_on_a_full_disk_has_a_whole_video(tiny: Path, tmp_path: Path, monk
     assert len(images_of(tmp_path / "r.mp4")) == 6
 
 
-def test_images_of_other_delays_than_those_that_the_run_has_found_are_decoded(tiny: Path, tmp_path: Path) -> None:
-    capture, result = open_capture(tiny), tmp_path / "r.h5"
-    film = tracked_with_film(capture, result)
+def test_images_of_other_delays_than_those_that_the_run_has_found_are_decoded(
+    tiny: Path, filmed: tuple[Path, Film], tmp_path: Path
+) -> None:
+    capture, result = open_capture(tiny), Path(shutil.copy(filmed[0], tmp_path))
+    film = filmed[1]
     late = np.array([0, 0, 1, 0]) / capture.fps
     revise_result(result, cameras=UsedCameras(capture.rig, late))
     overlay = Overlay(capture, read_result(result), after._WIDEST)

@@ -16,6 +16,7 @@ from tk.io.captures.frames import FrameSet
 from tk.io.results.reader import read_result
 from tk.model.body.body_points import LANDMARKS
 from tk.run.learned_masks import LEARNED, SEGMENTER
+from tk.run.offline import REFINED
 from tk.run.segmentation import Labels
 from tk.run.session import track_task
 
@@ -54,11 +55,13 @@ class Stop(Silent):
 
 
 def test_result_has_the_landmarks_that_were_seen_and_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
+    """The second pass goes over frames of both runs."""
     whole, stopped = tmp_path / "whole.h5", tmp_path / "stopped.h5"
     track_task(task(SETUP, ONE), whole, Silent())
-    assert track_task(task(SETUP, ONE), stopped, Stop()).interrupted
+    assert track_task(task(SETUP, ONE), stopped, Stop()).interrupted and REFINED not in read_result(stopped).model
     assert not track_task(task(SETUP, ONE), stopped, Silent(), resume=True).interrupted
     result, found = read_result(whole), read_result(stopped)
+    assert result.model[REFINED] == found.model[REFINED] == 1
     assert result.meta.landmark_names == LANDMARKS
     assert result.landmarks is not None and result.landmarks.shape == (len(POSES), len(RIG), len(LANDMARKS), 3)
     for frame, stored in zip(result.frames.tolist(), result.landmarks, strict=True):

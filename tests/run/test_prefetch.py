@@ -28,10 +28,11 @@ from tk.errors import ConfigError, VideoError, WorkerError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.reader import read_result
-from tk.run import prefetch, worker
+from tk.run import worker
 from tk.run.prefetch import Ahead, Observations, Serial, open_observations
 from tk.run.task import Task
 from tk.settings import Settings
+from tk.system.files import NamelessFile
 
 AHEAD = settings_file.from_toml(QUICK.replace("ahead = 0", "ahead = 2"))
 ROOT = Path(__file__).parents[2]
@@ -51,9 +52,15 @@ def nobody(text: str) -> None:
     raise AssertionError(text)
 
 
-@pytest.mark.parametrize(("masks", "image_step", "doubts"), [("auto", 1, False), ("none", 2, True), ("none", 0, False)])
-def test_prefetched_frames_equal_direct_ones(tiny: Path, masks: str, image_step: int, doubts: bool) -> None:
-    """Given masks are not in doubt; without pictures nobody asks for what is."""
+@pytest.mark.parametrize(
+    ("masks", "image_step", "doubts", "portable"),
+    [("auto", 1, False, "0"), ("none", 2, True, "1"), ("none", 0, False, "0")],
+)
+def test_prefetched_frames_equal_direct_ones(
+    tiny: Path, masks: str, image_step: int, doubts: bool, portable: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Given masks are not in doubt; without pictures nobody asks for what is. Portable: see :mod:`tk.system`."""
+    monkeypatch.setenv("TK_PORTABLE", portable)
     capture = open_capture(tiny, masks=masks)
     theirs = arrays(Ahead(Task.of(capture, AHEAD), nobody, image_step), 2, FRAMES)
     ours = arrays(Serial(Task.of(capture, AHEAD), nobody, image_step), 2, FRAMES)
@@ -73,7 +80,7 @@ def test_frames_are_made_here_if_no_memory_can_be_shared(tiny: Path, monkeypatch
         raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
 
     capture, notes = open_capture(tiny), list[str]()
-    monkeypatch.setattr(prefetch.os, "ftruncate", refuse)
+    monkeypatch.setattr(NamelessFile, "truncate", refuse)
     with open_observations(Task.of(capture, AHEAD), notes.append) as observations:
         assert isinstance(observations, Serial)
     assert notes == [
@@ -144,6 +151,7 @@ def test_a_defect_keeps_its_traceback(tiny: Path) -> None:
     assert "in _serve" in str(raised.value)
 
 
+@pytest.mark.usefixtures("system")
 def test_a_killed_process_is_reported_in_one_line(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run_clock(monkeypatch, EVERY_FRAME)
 
@@ -164,6 +172,7 @@ def test_a_killed_process_is_reported_in_one_line(tiny: Path, tmp_path: Path, mo
     np.testing.assert_array_equal(read_result(tmp_path / "r.h5").frames, np.arange(done))
 
 
+@pytest.mark.usefixtures("system")
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc")
 def test_no_process_or_memory_remains(tiny: Path) -> None:
     def open_files() -> int:
@@ -185,9 +194,13 @@ def test_no_process_or_memory_remains(tiny: Path) -> None:
     assert open_files() == before
 
 
+@pytest.mark.usefixtures("system")
 @pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="needs /proc")
-def test_the_process_ends_with_the_tracker(tiny: Path) -> None:
+def test_the_process_ends_with_the_tracker_and_no_file_remains(
+    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Killed, the tracker cannot tell it to."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
     script = (
         "import os, signal, sys, tk.run.prefetch, tk.settings, tk.io.captures.capture as c\n"
         "capture = c.open_capture(sys.argv[1])\n"
@@ -203,7 +216,7 @@ def test_the_process_ends_with_the_tracker(tiny: Path) -> None:
     pid, deadline = int(ran.stdout), time.monotonic() + 20
     while _runs(pid) and time.monotonic() < deadline:
         time.sleep(0.05)
-    assert not _runs(pid)
+    assert not _runs(pid) and not list(tmp_path.iterdir())
 
 
 def _runs(pid: int) -> bool:
@@ -231,9 +244,9 @@ def test_sigterm_ends_the_command_line_like_ctrl_c(tiny: Path, tmp_path: Path) -
 def test_one_core_needs_no_further_process(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = open_capture(tiny)
     assert isinstance(open_observations(Task.of(capture, Settings(ahead=0)), nobody), Serial)
-    monkeypatch.setattr("tk.run.worker.cores", lambda: 1)
+    monkeypatch.setattr("tk.system.machine.cores", lambda: 1)
     assert isinstance(open_observations(Task.of(capture, Settings()), nobody), Serial)
-    monkeypatch.setattr("tk.run.worker.cores", lambda: 2)
+    monkeypatch.setattr("tk.system.machine.cores", lambda: 2)
     with open_observations(Task.of(capture, Settings()), nobody) as source:
         assert isinstance(source, Ahead)
 

@@ -125,7 +125,7 @@ def test_cameras_that_were_moved_are_not_compared(tiny: Path, tmp_path: Path, mo
 
     monkeypatch.setattr(finish, "compare_cameras", compare)
     monkeypatch.setattr(CameraMonitor, "moved", np.array([False, True, False, False]))
-    track(open_capture(tiny), tmp_path / "moved.h5", settings_file.from_toml(QUICK), Silent())
+    track(open_capture(tiny), tmp_path / "moved.h5", settings_file.from_toml(QUICK), Silent(), frames=(0, 4))
     assert (seen[0] == [True, False, True, True]).all()
 
 
@@ -159,7 +159,7 @@ def test_late_videos_are_tracked_again(tiny: Path, tmp_path: Path, monkeypatch: 
 
 
 def test_delays_that_explain_the_images_worse_are_not_used(
-    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny: Path, refined: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The videos are synchronous; a delay of three frames is invented."""
 
@@ -167,12 +167,11 @@ def test_delays_that_explain_the_images_worse_are_not_used(
         return BetterCameras(rig, np.array([0.0, 0.0, 3.0, 0.0]), "refined")
 
     settings, path, reporter = settings_file.from_toml(QUICK), tmp_path / "again.h5", Silent()
-    track(open_capture(tiny), tmp_path / "plain.h5", settings)
     monkeypatch.setattr(finish, "refine_if_inconsistent", made_up)
     track(open_capture(tiny), path, settings, reporter)
     result = read_result(path)
     assert reporter.notes == [] and result.cameras is not None and not result.cameras.time_offset_s.any()
-    np.testing.assert_array_equal(result.joints, read_result(tmp_path / "plain.h5").joints)
+    np.testing.assert_array_equal(result.joints, read_result(refined).joints)
 
 
 def test_excluded_camera_is_used_after_the_refinement(turned_more: Path, tiny: Path, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ import pytest
 import tomli_w
 
 from tests import conftest
-from tests.conftest import EVERY_FRAME, FITTED, FRAMES, QUICK, Silent, Tk, run_clock
+from tests.conftest import EVERY_FRAME, FRAMES, QUICK, Silent, Tk, run_clock
 from tests.io.conftest import write_picture
 from tk.errors import ConfigError, ResultError
 from tk.io import settings_file
@@ -336,11 +336,9 @@ def test_requested_frames_are_tracked(tiny: Path) -> None:
     assert choose_frames(late, (0, 6), notes.append) == (5, 6)
 
 
-@pytest.mark.parametrize("method", ["region", "volumetric"])
-def test_masks_are_made_from_the_videos(tiny: Path, tmp_path: Path, method: str) -> None:
-    config, path = settings_file.from_toml(FITTED), tmp_path / "r.h5"
-    capture = open_capture(tiny, masks="none")
-    assert conftest.track(capture, path, config, method=method, frames=(0, 3)).lost == 0
+def test_masks_are_made_from_the_videos(tiny: Path, tmp_path: Path) -> None:
+    path, capture = tmp_path / "r.h5", open_capture(tiny, masks="none")
+    assert conftest.track(capture, path, CONFIG, frames=(0, 3)).lost == 0
     found, truth = read_result(path), read_joints(tiny / "truth.h5").positions[:3]
     assert np.linalg.norm(found.joints - truth, axis=2).mean() < 0.1 and (found.timing["masks"] > 0).all()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
@@ -39,10 +40,11 @@ def test_first_call_does_not_count() -> None:
 
 
 def here(*_: object, **__: object) -> Any:
-    """Instead of a process of its own, which would compile the kernels again."""
+    """Instead of a process of its own, which would compile the kernels again; another process could take the call."""
 
     def submit(function: Callable[..., object], *arguments: object) -> SimpleNamespace:
-        result = function(*arguments)
+        call, given = pickle.loads(pickle.dumps((function, arguments)))
+        result = call(*given)
         return SimpleNamespace(result=lambda: result)
 
     return nullcontext(SimpleNamespace(submit=submit))
@@ -51,7 +53,6 @@ def here(*_: object, **__: object) -> Any:
 def test_benchmark_of_a_small_capture_runs(
     tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In this process; the benchmark of the silhouette tracker starts another one."""
     monkeypatch.setattr(bench, "ProcessPoolExecutor", here)
     pytest.importorskip("open3d", exc_type=ImportError)
     file = tmp_path / "bench.json"
@@ -81,8 +82,9 @@ def test_benchmark_of_a_small_capture_runs(
 
 
 def test_the_silhouette_tracker_has_stages_of_its_own(
-    tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(bench, "ProcessPoolExecutor", here)
     file = tmp_path / "bench.json"
     options = ["--method", "silhouette", "--cameras", "cam1,cam2,cam4", "--repeat", "1", "--frames", "4"]
     main([str(tiny), *options, "--json", str(file)])

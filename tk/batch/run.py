@@ -18,9 +18,9 @@ from tk.batch.jobs import DONE, FAILED, RECORDS, Job, Outcome, described, make_j
 from tk.batch.summary import write_summary
 from tk.batch.work import TOPIC, work
 from tk.errors import ConfigError, ResultError, TkError, WorkerError
-from tk.io.paths import locked
 from tk.run.task import RecordingOptions
-from tk.run.worker import cores
+from tk.system.files import locked
+from tk.system.machine import cores
 
 #: seconds to wait for a scheduler's answer; a remote one may be slow, an absent one never answers
 _PATIENCE_S = 8.0

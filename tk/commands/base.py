@@ -5,9 +5,7 @@ from __future__ import annotations
 import errno
 import io
 import json
-import signal
 import sys
-import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -19,6 +17,7 @@ import click
 
 from tk.commands.console import ConsoleReporter
 from tk.errors import ConfigError, TkError
+from tk.system.signals import request_as_interrupt
 
 if TYPE_CHECKING:
     from tk.run.task import Choice, RecordingOptions
@@ -42,7 +41,7 @@ def exit_with(code: int, line: str = "") -> NoReturn:
 def errors_in_one_line() -> Iterator[None]:
     """Print a user's mistake as one line and exit with 2; with 1 after an interruption or if a disk is full."""
     try:
-        with _terminated_as_interrupted():
+        with request_as_interrupt():
             yield
     except TkError as error:
         exit_with(error.exit_code, error.line)
@@ -57,24 +56,6 @@ def errors_in_one_line() -> Iterator[None]:
             raise
         command = error.ctx.command_path if error.ctx else "tk"
         exit_with(2, f"{' '.join(error.format_message().split())} See {command} --help")
-
-
-@contextmanager
-def _terminated_as_interrupted() -> Iterator[None]:
-    """Handle SIGTERM, which `kill` and cluster schedulers send, as Ctrl-C."""
-    if threading.current_thread() is not threading.main_thread():  # Python sets handlers in the main thread only
-        yield
-        return
-
-    def interrupt(*_: object) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not stop the clean-up
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
 
 
 class Commands(click.Group):

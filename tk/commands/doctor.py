@@ -19,7 +19,8 @@ from pathlib import Path
 import click
 
 from tk.commands import base
-from tk.run.worker import cores
+from tk.system import LINUX, machine
+from tk.system.signals import how_it_ended
 
 # Limit of a check in its own process. A first import from a slow disk and the first compilation take some 20 s.
 _LIMIT_S = 120.0
@@ -40,7 +41,7 @@ def _try(code: str, remedy: str = "") -> str:
     except subprocess.TimeoutExpired:
         raise Missing(f"gave no answer for {_LIMIT_S:.0f} s{remedy}") from None
     if done.returncode < 0:
-        raise Missing(f"the process was ended by signal {-done.returncode}{remedy}")
+        raise Missing(f"the process {how_it_ended(done.returncode)}{remedy}")
     if done.returncode:
         raise Missing((done.stderr.decode(errors="replace").strip().splitlines() or ["no reason given"])[-1] + remedy)
     return done.stdout.decode(errors="replace").strip()
@@ -63,7 +64,7 @@ def _glibc() -> str:
     name, found = platform.libc_ver()
     if name != "glibc":
         text = f"{name or 'unknown'} {found}".strip()
-        if sys.platform == "linux":
+        if LINUX:
             raise Missing(f"{text}; Taichi has wheels for glibc only: use another system")
         return text
     least = {package: _least_glibc(package) for package in ("taichi", "open3d-cpu")}
@@ -140,14 +141,13 @@ def _cache() -> str:
 
 def _cores() -> str:
     limit = os.environ.get("TK_THREADS")
-    return f"{cores()}" + (f", TK_THREADS={limit}" if limit else "")
+    return f"{machine.cores()}" + (f", TK_THREADS={limit}" if limit else "")
 
 
 def _memory() -> str:
-    free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    info = Path("/proc/meminfo")  # counts what the system's cache can give back, too
-    if info.exists() and (found := re.search(r"MemAvailable:\s+(\d+) kB", info.read_text())):
-        free = 1024 * int(found[1])
+    free = machine.available_memory()
+    if free is None:
+        return "this system does not report how much is free"
     if free < _MEMORY:
         raise Missing(f"close other programs, or use fewer cameras: {free / 1e9:.1f} GB may be too little")
     return f"{free / 1e9:.1f} GB available"

@@ -78,7 +78,8 @@ def track(
         check_result_path(output, force, resume)
         reporter.stage(f"opening {capture}")
         opened = open_recording(capture, options.cameras, options.masks, options.settings.resample)
-        film = None if no_report else film_for(opened, output)
+        continued = resume and output.exists()  # its first frames are no longer there to be kept
+        film = None if no_report or continued else film_for(opened, output)
         summary = session.track(opened, output, options, reporter, resume, force, film)
         if not no_report:
             draw_video_and_report(opened, output, summary, reporter, quiet, film)

@@ -3,8 +3,8 @@
 HDF5 changes its metadata in place and in several steps, so a process that is killed meanwhile leaves a file that does
 not open. A published file is therefore never changed. Two files with the same bytes, the twins, are in a hidden folder
 beside it. HDF5 writes to one of them. :meth:`Hdf5Writer.publish` gives this twin the published name. Before the next
-write, the other twin receives the same changes, and HDF5 continues there. Only a closed file is synced to the disk, so
-a power cut may lose an open one.
+write, the other twin receives the same changes, and HDF5 continues there. Where an open file can have no second name, a
+copy is published, and there is one twin. Only a closed file is synced to the disk, so a power cut may lose an open one.
 """
 
 from __future__ import annotations
@@ -13,8 +13,6 @@ import contextlib
 import io
 import os
 import shutil
-import signal
-import threading
 import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -23,7 +21,8 @@ from typing import Any
 import h5py
 
 from tk.errors import FULL, DiskFullError, ResultBusyError, ResultError
-from tk.io.paths import locked
+from tk.system.files import locked, publish
+from tk.system.signals import deferred
 
 #: exceptions that h5py raises for a full disk, a removed folder or a damaged file
 _WRITE_ERRORS = (OSError, RuntimeError, KeyError, ValueError, TypeError)
@@ -54,7 +53,7 @@ class Hdf5Writer:
             busy = f"{target}: another run is writing this result; wait for it, or choose another name"
             undo.enter_context(locked(self._folder, ResultBusyError(busy)))
             undo.callback(shutil.rmtree, self._folder, ignore_errors=True)
-            for leftover in self._folder.iterdir():  # of a run that was killed
+            for leftover in self._folder.glob("*.h5"):  # of a run that was killed
                 leftover.unlink()
             self._twins = _Twins(self._folder, source)
             undo.callback(self._twins.close)
@@ -83,9 +82,11 @@ class Hdf5Writer:
             self._close_file()  # HDF5 changes the file while closing it
             if publish:
                 self._twins.check()
-                with self._twins.path.open("rb") as stream:
+                with self._twins.path.open("r+b") as stream:  # Windows syncs only what may be written
                     os.fsync(stream.fileno())
                 self._rename()
+        with contextlib.suppress(OSError):  # still there on Windows, where the lock's file goes with the lock
+            self._folder.rmdir()
 
     def __enter__(self) -> Hdf5Writer:
         return self
@@ -94,14 +95,8 @@ class Hdf5Writer:
         self.close(publish=kind is None)
 
     def _rename(self) -> None:
-        new = self._folder / "new.h5"
-        new.unlink(missing_ok=True)  # left by a rename that failed
-        try:
-            os.link(self._twins.path, new)
-        except OSError:  # a file system without hard links
-            shutil.copyfile(self._twins.path, new)
-        os.replace(new, self._target)
-        self._twins.keep()
+        if publish(self._twins.path, self._folder / "new.h5", self._target):
+            self._twins.keep()
 
 
 class _Twins:
@@ -191,28 +186,9 @@ def writing(target: Path, hint: str = "make space, then continue with --resume")
     the remedy for a full disk.
     """
     try:
-        with _signals_deferred():
+        with deferred():
             yield
     except _WRITE_ERRORS as error:
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
         kind = DiskFullError if getattr(error, "errno", None) in FULL else ResultError
         raise kind(f"{target}: cannot be written: {reason}", hint if kind is DiskFullError else "") from error
-
-
-@contextlib.contextmanager
-def _signals_deferred() -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():  # Python handles signals in the main thread only
-        yield
-        return
-    received: list[int] = []
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    handlers = {number: handler for number, handler in handlers.items() if handler is not None}  # set from Python
-    for number in handlers:
-        signal.signal(number, lambda number, _: received.append(number))
-    try:
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-        for caught in received:
-            signal.raise_signal(caught)

@@ -7,7 +7,6 @@ replaces only a file of the kind that the command writes.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import re
 import shutil
@@ -17,6 +16,7 @@ from pathlib import Path
 
 from tk.errors import ConfigError, ExportError, TkError, unwritable
 from tk.io.toml import load_toml
+from tk.system.files import replace
 
 #: files and folders of a capture that tk reads
 _CAPTURE_PARTS = (
@@ -138,28 +138,12 @@ def replacing(path: Path, kind: type[TkError] = ExportError) -> Iterator[Path]:
     try:
         yield part
         if part.exists():
-            os.replace(part, path)
+            replace(part, path)
     except OSError as error:
         raise unwritable(path, error, kind) from error
     finally:
         with contextlib.suppress(OSError):
             shutil.rmtree(part) if part.is_dir() else part.unlink()
-
-
-@contextlib.contextmanager
-def locked(folder: Path, busy: TkError) -> Iterator[None]:
-    """Lock a folder; raise ``busy`` if another process has locked it. Some file systems have no locks."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise busy from None
-        except OSError:
-            pass
-        yield
-    finally:
-        os.close(handle)
 
 
 def resolved(path: Path) -> Path:

@@ -20,6 +20,7 @@ import warnings
 from pathlib import Path
 
 from tk.kernels.taichi_internals import program, quick_decorators, quick_import, shorten_notes
+from tk.system import WINDOWS, machine
 
 _LOG = logging.getLogger(__name__)
 
@@ -31,14 +32,16 @@ os.environ.setdefault("TI_LOG_LEVEL", "error")
 def _choose_cache() -> None:
     """Set the folder for compiled kernels where Taichi's default fails: without HOME Taichi aborts the process, and
     without write permission it compiles everything again at each start."""
+    if WINDOWS:  # Taichi's folder there depends on no variable
+        return
     default = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))  # the password file has homes
     if _is_usable(default):
         if "HOME" not in os.environ:
             os.environ["XDG_CACHE_HOME"] = str(default)
         return
-    temporary = Path(tempfile.gettempdir()) / f"tk-cache-{os.getuid()}"
+    temporary = machine.temporary_folder("tk-cache")
     # compiled kernels are code: those of another user must not run
-    ours = _is_usable(temporary) and temporary.stat().st_uid == os.getuid()
+    ours = _is_usable(temporary) and machine.is_ours(temporary)
     os.environ["XDG_CACHE_HOME"] = str(temporary) if ours else tempfile.mkdtemp(prefix="tk-cache-")
 
 

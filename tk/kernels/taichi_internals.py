@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-_OURS = "tk."
+_OURS = "tk.", "scripts.synthetic."
 
 
 def program() -> Any:

@@ -2,13 +2,13 @@
 
 A thread would not do: Taichi's launches hold the interpreter, so the tracker would wait while a thread segments. The
 process is a fresh interpreter (a fork would hang in Taichi, and multiprocessing's spawn imports the user's script
-again). Messages pass through a socket, frames through memory that both processes map, divided into slots of one frame:
+again). Messages pass through a channel, frames through memory that both processes map, divided into slots of one frame:
 
     tracker ── task, span of frames, numbers of free slots ──► process ──► small images (tk.io.captures.film)
             ◄── _Ready: number of a slot with a frame, notes, _Failed, None after the last frame ──
 
-The memory has no name, so the system frees it when both processes have ended, however they end. When the tracker ends,
-the socket closes, and the process ends, too. The frames equal those of :class:`Serial` bit for bit.
+The system frees the memory when both processes have ended, however they end. When the tracker ends, the channel closes,
+and the process ends, too. The frames equal those of :class:`Serial` bit for bit.
 """
 
 from __future__ import annotations
@@ -16,21 +16,15 @@ from __future__ import annotations
 import contextlib
 import math
 import mmap
-import os
 import pickle
-import select
-import signal
-import socket
 import subprocess
 import sys
-import tempfile
 import time
 import traceback
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Protocol
 
@@ -46,6 +40,9 @@ from tk.run import worker
 from tk.run.segmentation import Labeller, make_labeller, mask_source, prepare_kernels
 from tk.run.task import Task
 from tk.segmenters import Segmenter
+from tk.system import machine, signals
+from tk.system.files import NamelessFile, give_back
+from tk.system.processes import Channel, parent
 from tk.trackers.protocol import Frame, Stopwatch
 
 Note = Callable[[str], None]
@@ -61,7 +58,6 @@ _HELD = 2
 _SPARE = 42
 #: most bytes of the frames made ahead: a few of eight full-HD cameras. Fewer would make the process wait.
 _AHEAD_BYTES = 400_000_000
-_HANDLES = b"memory, film"  # goes with the descriptors of the memory that both processes share, and of the film
 #: seconds in which the process may end by itself. A shorter time would lose kernels that it has compiled.
 _PATIENCE_S = 5.0
 
@@ -98,7 +94,7 @@ def open_observations(task: Task, note: Note, image_step: int = 1, film: Film | 
         CaptureError: there is nothing to make masks from.
     """
     mask_source(task.source)  # before a process is started
-    if task.settings.ahead and worker.cores() > 1 and sys.executable and _can_be_sent(task.source.segmenter):
+    if task.settings.ahead and machine.cores() > 1 and sys.executable and _can_be_sent(task.source.segmenter):
         try:
             return Ahead(task, note, image_step, film)
         except OSError as error:  # ulimit -f, -n or -v
@@ -106,6 +102,8 @@ def open_observations(task: Task, note: Note, image_step: int = 1, film: Film | 
                 f"no memory can be shared with another process ({error.strerror}): frames are made one after the other"
             )
     worker.dismiss()
+    if film is not None:
+        film.file.hide()
     return Serial(task, note, image_step, film)
 
 
@@ -173,6 +171,7 @@ class _Order:
     task: Task
     image_step: int
     slots: int
+    memory: NamelessFile
     film: Film | None
 
 
@@ -212,17 +211,6 @@ class _Layout:
         return images.reshape(self.images), masks.reshape(self.masks), uncertain.reshape(self.masks)
 
 
-def _nameless_file(size: int) -> int:
-    """A descriptor of ``size`` bytes of memory that the system frees with their last user, even a killed one."""
-    if hasattr(os, "memfd_create"):  # Linux
-        handle = os.memfd_create("tk-ahead", os.MFD_CLOEXEC)
-    else:
-        with tempfile.TemporaryFile() as file:
-            handle = os.dup(file.fileno())
-    os.ftruncate(handle, size)
-    return handle
-
-
 # --- the tracker's side -----------------------------------------------------------------------------------------------
 
 
@@ -238,20 +226,14 @@ class Ahead:
         self._layout = _Layout(task.setup.rig, image_step)
         slots = max(min(task.settings.ahead, _AHEAD_BYTES // self._layout.bytes), 1)
         size = (slots + _SPARE) * self._layout.bytes  # the system provides memory where it is written
-        handle = _nameless_file(size)
-        self._memory = mmap.mmap(handle, size)
+        memory = NamelessFile.in_memory(size)
+        self._memory = memory.map()
         self._free = list(range(slots, slots + _SPARE))
         self._dropped: deque[int] = deque()  # slots of frames that are no longer referenced
         self._begun = False
-        try:
-            started = worker.take()
-            self._process = started.process
-            with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-                socket.send_fds(started.end, [_HANDLES], [handle] if film is None else [handle, film.handle])
-        finally:
-            os.close(handle)
-        self._connection = Connection(started.end.detach())
-        self._send(_Order(task, image_step, slots, film))
+        child = worker.take()
+        self._process, self._channel = child.process, child.channel
+        self._send(_Order(task, image_step, slots, memory, film))
 
     def frames(self, start: int, stop: int | None) -> Iterator[Observed]:
         self._begun = True
@@ -287,13 +269,13 @@ class Ahead:
         """Make the dropped frames' slots free."""
         while self._dropped:
             slot = self._dropped.popleft()
-            if len(self._free) < _SPARE - _HELD and hasattr(mmap, "MADV_REMOVE"):  # Linux
-                self._memory.madvise(mmap.MADV_REMOVE, slot * self._layout.bytes, self._layout.bytes)
+            if len(self._free) < _SPARE - _HELD:
+                give_back(self._memory, slot * self._layout.bytes, self._layout.bytes)
             self._free.append(slot)
 
     def _send(self, message: object) -> None:
-        with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # its last messages are still to be read
-            self._connection.send(message)
+        with contextlib.suppress(EOFError):  # its last messages are still to be read
+            self._channel.send(message)
 
     def _receive(self) -> _Ready | None:
         """The next frame, None after the last.
@@ -305,9 +287,10 @@ class Ahead:
         """
         while True:
             try:
-                message = self._connection.recv()
-            except (EOFError, ConnectionResetError):
-                raise WorkerError(f"{self._where}: {self._last_words()}; ahead = 0 avoids this process") from None
+                message = self._channel.receive()
+            except EOFError:
+                how = f"the process that decodes and segments its frames {signals.how_it_ended(self._process.wait())}"
+                raise WorkerError(f"{self._where}: {how}; ahead = 0 avoids this process") from None
             if isinstance(message, str):
                 self._note(message)
             elif isinstance(message, _Failed):
@@ -317,12 +300,6 @@ class Ahead:
             else:
                 return message
 
-    def _last_words(self) -> str:
-        code = self._process.wait()
-        how = f"ended with code {code}" if code >= 0 else f"was ended by {signal.Signals(-code).name}"
-        memory = " (out of memory?)" if code == -signal.SIGKILL else ""
-        return f"the process that decodes and segments its frames {how}{memory}"
-
     def __enter__(self) -> Ahead:
         return self
 
@@ -331,7 +308,7 @@ class Ahead:
 
     def close(self) -> None:
         """End the process. Closing twice is fine."""
-        self._connection.close()
+        self._channel.close()
         if self._begun:  # it ends by itself, and stores the kernels that it has compiled
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(_PATIENCE_S)
@@ -345,16 +322,16 @@ class Ahead:
 class _Slots:
     """The process's end of the shared memory."""
 
-    def __init__(self, tracker: Connection, memory: mmap.mmap, order: _Order) -> None:
+    def __init__(self, tracker: Channel, order: _Order) -> None:
         self._tracker = tracker
-        self._memory = memory
+        self._memory = order.memory.map()
         self._layout = _Layout(order.task.setup.rig, order.image_step)
         self._free = list(range(order.slots))
 
     def put(self, observation: Frame, watch: Stopwatch) -> None:
         """Hand a frame over; waits for a free slot."""
         while not self._free:
-            self._free.append(self._tracker.recv())
+            self._free.append(self._tracker.receive())
         number, size = self._free.pop(), self._layout.bytes
         images, masks, uncertain = self._layout.layers(np.frombuffer(self._memory, np.uint8, size, number * size))
         images[...] = observation.images
@@ -365,48 +342,36 @@ class _Slots:
         self._tracker.send(_Ready(number, bare, observation.uncertain is not None, watch.laps))
 
 
-def serve(descriptor: int) -> None:
-    """Run the process: take a task, pass frames until the last one, or until the tracker has ended.
-
-    Args:
-        descriptor: of the socket to the tracker.
-    """
+def serve() -> None:
+    """Run the process: take a task, pass frames until the last one, or until the tracker has ended."""
+    tracker = parent()
     cv2.setNumThreads(1)  # the cameras are segmented in parallel already
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # may be sent to all processes of a job; the tracker ends this one
-    with socket.socket(fileno=descriptor) as end:
-        _warm_up(end)
-        _, handles, _, _ = socket.recv_fds(end, len(_HANDLES), 2)
-        if not handles:
-            return  # the tracker has ended
-        connection = end.detach()
-    with Connection(connection) as tracker, mmap.mmap(handles[0], 0) as memory:
-        os.close(handles[0])
-        # the tracker closed its end of the socket
-        with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
-            try:
-                _serve(tracker, memory, handles[1:])
-            except (EOFError, BrokenPipeError, ConnectionResetError):
-                raise
-            except TkError as error:
-                tracker.send(_Failed(error, ""))
-            except Exception:
-                tracker.send(_Failed(None, traceback.format_exc()))
+    signals.ignore_requests()  # may be sent to all processes of a job; the tracker ends this one
+    with contextlib.suppress(EOFError):  # the tracker closed its end of the channel
+        _warm_up(tracker)
+        try:
+            _serve(tracker)
+        except EOFError:
+            raise
+        except TkError as error:
+            tracker.send(_Failed(error, ""))
+        except Exception:
+            tracker.send(_Failed(None, traceback.format_exc()))
 
 
-def _warm_up(end: socket.socket) -> None:
+def _warm_up(tracker: Channel) -> None:
     """Compile the kernels of the masks until the task arrives: the tracker's process imports meanwhile."""
     for step in (ensure_runtime, prepare_kernels):
-        if select.select([end], [], [], 0)[0]:
+        if tracker.waiting():
             return
         step()
 
 
-def _serve(tracker: Connection, memory: mmap.mmap, film_handle: Sequence[int]) -> None:
-    order: _Order = tracker.recv()
-    film = replace(order.film, handle=film_handle[0]) if order.film else None
+def _serve(tracker: Channel) -> None:
+    order: _Order = tracker.receive()
     label = make_labeller(order.task, tracker.send)
-    slots = _Slots(tracker, memory, order)
-    span: tuple[int, int | None] = tracker.recv()
-    for observation, watch in observe(order.task, label, tracker.send, span, order.image_step, film):
+    slots = _Slots(tracker, order)
+    span: tuple[int, int | None] = tracker.receive()
+    for observation, watch in observe(order.task, label, tracker.send, span, order.image_step, order.film):
         slots.put(observation, watch)
     tracker.send(None)

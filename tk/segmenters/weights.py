@@ -18,6 +18,7 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 from tk.errors import ConfigError
+from tk.system.machine import cache_folder
 
 _LOG = logging.getLogger(__name__)
 
@@ -44,13 +45,7 @@ _TIMEOUT_S = 600  # of pip's download; a slower connection fails with a message
 
 def default_cache_dir() -> Path:
     """Return the platform's folder for this program's cached files; it need not exist."""
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA", "")
-    elif sys.platform == "darwin":
-        base = os.path.join("~", "Library", "Caches")
-    else:
-        base = os.environ.get("XDG_CACHE_HOME", "")
-    return Path(os.path.expanduser(base or os.path.join("~", ".cache"))) / "tk"
+    return cache_folder() / "tk"
 
 
 def weights() -> dict[str, Path]:

@@ -16,6 +16,7 @@ import numpy as np
 from tk.errors import DisplayError, ExportError
 from tk.render.palette import BACKGROUND, unit_rgb
 from tk.render.scene import camera_towards
+from tk.system import LINUX
 from tk.view.contents import FIELD_OF_VIEW_DEG, SIZE, Contents
 
 _ALTERNATIVE = "tk report RESULT.h5 writes an HTML page to look at instead"
@@ -32,7 +33,7 @@ _IDLE_S = 0.01  # sleep between two events; longer ones would delay frames, shor
 
 def require_display() -> None:
     """Check that there is a display: without one, Open3D never returns or ends the process."""
-    if sys.platform != "linux":
+    if not LINUX:
         return
     if not os.environ.get("DISPLAY"):
         wayland = " (Wayland alone is not enough: Open3D needs XWayland)" if os.environ.get("WAYLAND_DISPLAY") else ""

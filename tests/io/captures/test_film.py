@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from tk.io.captures.film import Film, filmed
+from tk.system.files import NamelessFile
 
 
 def scene(seed: int, shape: tuple[int, int]) -> np.ndarray:
@@ -37,12 +39,14 @@ def film(tmp_path: Path) -> Film:
 IMAGES = {k: [scene(k, (80, 120)), scene(k + 100, (70, 100))] for k in range(2, 9)}
 
 
+@pytest.mark.usefixtures("system")
 @pytest.mark.parametrize("plain", [True, False])
 def test_images_of_the_chosen_frames_are_kept_small(film: Film, tmp_path: Path, plain: bool) -> None:
     """Without compression if all images of the film together are small."""
     if not plain:
         film.frames = range(3, 50_000, 2)
     images = {index: IMAGES[index] for index in (2, 3, 5, 7)}
+    film.file.hide()  # as a run does
     for index, both in images.items():
         film.put(index, both, nobody)
     assert not list(tmp_path.iterdir()), "nothing remains, however the process ends"
@@ -56,40 +60,38 @@ def test_images_of_the_chosen_frames_are_kept_small(film: Film, tmp_path: Path, 
 
 
 def test_another_process_continues_the_film(film: Film) -> None:
-    theirs = replace(film, handle=os.dup(film.handle))
+    theirs = replace(film, file=NamelessFile(os.dup(film.file.handle)))
     for index, images in IMAGES.items():
         theirs.put(index, images, nobody)
     assert film.places().keys() == {3, 5, 7}
-    os.truncate(film.handle, os.fstat(film.handle).st_size - 1)  # it was killed while it wrote
+    film.file.truncate(film.file.size() - 1)  # it was killed while it wrote
     assert film.places().keys() == {3, 5}
-    os.truncate(film.handle, int(film.places()[5][0]) - 1)
+    film.file.truncate(int(film.places()[5][0]) - 1)
     assert film.places().keys() == {3}
 
 
 def test_room_is_left_on_the_disk(film: Film, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     notes: list[str] = []
     film.put(3, IMAGES[3], notes.append)
-    free = os.fstatvfs(film.handle)
-    full = SimpleNamespace(f_bavail=10**9 // free.f_frsize, f_frsize=free.f_frsize)
-    monkeypatch.setattr(os, "fstatvfs", lambda _: full)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=10**9))
     film.put(5, IMAGES[5], notes.append)
     monkeypatch.undo()
     film.put(7, IMAGES[7], notes.append)
     (note,) = notes
     assert note.startswith(f"{tmp_path}: ") and "GB is free" in note and "\n" not in note
-    assert not film.places() and os.fstat(film.handle).st_size == 0
+    assert not film.places() and film.file.size() == 0
 
 
 def test_a_full_disk_ends_the_film(film: Film, monkeypatch: pytest.MonkeyPatch) -> None:
     notes: list[str] = []
-    write = os.pwritev
+    write = NamelessFile.write
 
-    def full(handle: int, data: list[memoryview], place: int) -> int:
+    def full(file: NamelessFile, data: list[memoryview], place: int) -> int:
         if place:
             raise OSError(errno.EDQUOT, os.strerror(errno.EDQUOT))
-        return write(handle, data, place)
+        return write(file, data, place)
 
-    monkeypatch.setattr(os, "pwritev", full)
+    monkeypatch.setattr(NamelessFile, "write", full)
     for index, images in IMAGES.items():
         film.put(index, images, notes.append)
     assert len(notes) == 1 and os.strerror(errno.EDQUOT) in notes[0] and not film.places()

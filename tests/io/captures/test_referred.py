@@ -156,31 +156,23 @@ def test_a_gap_leaves_the_camera_blank_and_is_reported(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".ts", ".avi"])
 @pytest.mark.parametrize("bframes", ["0", "3"])
-def test_reading_begins_at_a_key_image_and_counts_by_time_stamps(
-    tmp_path: Path, suffix: str, bframes: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_reading_begins_at_a_key_image_and_counts_by_time_stamps(tmp_path: Path, suffix: str, bframes: str) -> None:
     own = np.arange(400) / 25
     path = tmp_path / f"a{suffix}"
     record(path, own, own, g="20", bf=bframes, preset="veryfast", sc_threshold="0")
     clip = open_video_files([path])
     if clip.times_s is None:
         pytest.skip("the file gives no times")
-    decoded, out = [0], np.empty((HEIGHT, WIDTH, 3), np.uint8)
-    number = video._PyAVReader._number
-    monkeypatch.setattr(
-        video._PyAVReader, "_number", lambda self, image: decoded.__setitem__(0, decoded[0] + 1) or number(self, image)
-    )
-    reader = clip.open()
-    at_number = 0
+    out, reader = np.empty((HEIGHT, WIDTH, 3), np.uint8), clip.open()
     for wanted in (3, 333, 334, 391):
         at_number = reader.jump(wanted)
+        assert at_number >= wanted - 40 or not len(clip.keys)  # a key image every 20: it decodes few others
         while at_number < wanted:
             reader.skip()
             at_number += 1
         reader.read(out)
         assert seconds_in(out) == own[wanted]
     reader.close()
-    assert decoded[0] < (100 if len(clip.keys) else np.inf)
     assert len(clip.keys) == 20 or (suffix, bframes) == (".avi", "3")  # such a file has no presentation times
 
 

@@ -91,7 +91,7 @@ def test_gradient_is_that_of_the_cost_with_offsets_integrated_out(with_depth: bo
 def test_depth_shows_whether_a_forearm_points_at_the_camera_or_away_from_it() -> None:
     """Two poses of an arm that look alike in the only image."""
     arm = [k for k, name in enumerate(NAMES) if name.startswith(("shoulder_l", "elbow_l"))]
-    poses = np.tile(POSE, (4000, 1))
+    poses = np.tile(POSE, (2000, 1))
     poses[:, arm] += np.random.default_rng(5).uniform(-1.5, 1.5, (len(poses), len(arm)))
     points = BODY.skeleton.joints(BODY.skeleton.clip(poses))
     elbow, wrist = points[:, JOINTS.index("elbow_l")], points[:, JOINTS.index("wrist_l")]

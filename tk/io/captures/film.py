@@ -8,9 +8,7 @@ compressed. Those of a short one are not, and most systems delete them before th
 from __future__ import annotations
 
 import math
-import os
-import tempfile
-import weakref
+import shutil
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -22,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.io.captures.clip import Image
+from tk.system.files import NamelessFile
 
 # Most frames of a second, and in all: every run pays the time for them.
 _MOST_PER_S, _MOST = 15.0, 3000
@@ -43,18 +42,18 @@ def filmed(begin: int, stop: int, fps: float) -> range:
 
 @dataclass
 class Film:
-    """The images of :attr:`frames`. Another process continues it with a ``handle`` of its own.
+    """The images of :attr:`frames`. Another process continues a film that is sent to it.
 
     Attributes:
         where: the folder, as messages name it.
         sizes: (C,) width and height of the images.
-        handle: descriptor of the file.
+        file: where they are.
         frames: which frames are kept; none until a run has chosen them.
     """
 
     where: Path
     sizes: Sequence[tuple[int, int]]
-    handle: int
+    file: NamelessFile
     frames: range = range(0)
     _end: int = field(default=0, init=False)  # bytes written
 
@@ -62,12 +61,9 @@ class Film:
     def in_folder(folder: Path, sizes: Sequence[tuple[int, int]]) -> Film | None:
         """Return a film in a folder; None if no file can be made there."""
         try:
-            with tempfile.TemporaryFile(dir=folder) as file:
-                film = Film(folder, sizes, os.dup(file.fileno()))
+            return Film(folder, sizes, NamelessFile.in_folder(folder))
         except OSError:
             return None
-        weakref.finalize(film, os.close, film.handle)
-        return film
 
     def put(self, index: int, images: Sequence[Image], note: Callable[[str], None]) -> None:
         """Keep the images (C,) of a frame if it is one of :attr:`frames`. If the disk is full, ``note`` receives a
@@ -79,14 +75,13 @@ class Film:
         record = [_head(index, [each.nbytes for each in coded]), *coded]
         size = sum(part.nbytes for part in record)
         try:
-            space = os.fstatvfs(self.handle)
-            if space.f_bavail * space.f_frsize < LEFT_FREE + size:
+            if shutil.disk_usage(self.where).free < LEFT_FREE + size:
                 raise OSError(f"less than {LEFT_FREE / 1e9:g} GB is free")
-            if os.pwritev(self.handle, [part.data for part in record], self._end) < size:
+            if self.file.write([part.data for part in record], self._end) < size:
                 raise OSError("it is full")
         except OSError as error:
             self.frames = range(0)
-            os.ftruncate(self.handle, 0)
+            self.file.truncate(0)
             reason = error.strerror or error
             note(f"{self.where}: no small images can be kept there ({reason}): the videos are decoded twice")
             return
@@ -94,10 +89,10 @@ class Film:
 
     def places(self) -> dict[int, NDArray[np.int64]]:
         """Return the frames in the file, and where the images of each begin and end, (C + 1,) bytes."""
-        found, end, whole = dict[int, NDArray[np.int64]](), 0, os.fstat(self.handle).st_size
+        found, end, whole = dict[int, NDArray[np.int64]](), 0, self.file.size()
         size = _head(0, [0] * len(self.sizes)).nbytes
         while end + size <= whole:
-            index, *sizes = np.frombuffer(os.pread(self.handle, size, end), np.int64)
+            index, *sizes = np.frombuffer(self.file.read(size, end), np.int64)
             bounds = end + size + np.cumsum([0, *sizes])
             end = int(bounds[-1])
             if end <= whole:  # else the process was killed while it wrote
@@ -118,7 +113,7 @@ class Film:
                 yield frame, result()
 
     def _read(self, bounds: NDArray[np.int64]) -> list[Image]:
-        record = np.frombuffer(os.pread(self.handle, int(bounds[-1] - bounds[0]), int(bounds[0])), np.uint8)
+        record = np.frombuffer(self.file.read(int(bounds[-1] - bounds[0]), int(bounds[0])), np.uint8)
         coded = np.split(record, bounds[1:-1] - bounds[0])
         if self._plain:
             return [image.reshape(height, width, 3) for image, (width, height) in zip(coded, self.sizes, strict=True)]

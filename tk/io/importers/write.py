@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import re
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,6 +23,8 @@ from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import all_look_away, closest_to_axes, common_boxes
 from tk.model.cameras.up import shown, up_text
 from tk.model.cameras.volume import Volume
+from tk.system.files import link_or_copy
+from tk.system.names import file_name
 
 #: least side of a working volume, metres: a person with arms spread needs more
 _ROOM_M = 1.5
@@ -159,12 +159,10 @@ def _up_toml(up: str) -> str:
 
 
 def _renamed(rig: Rig, notes: list[str]) -> Rig:
-    """Return the cameras with names that are valid file names and distinct."""
+    """Return the cameras with names that files can have on every system, and distinct."""
     cameras: list[Camera] = []
     for camera in rig:
-        name = re.sub(r"[^\w.+-]+", "_", camera.name).strip(".") or "camera"
-        while name == "metadata" or name in [other.name for other in cameras]:
-            name += "_"
+        name = file_name(camera.name, "camera", ["metadata", *(other.name for other in cameras)])
         if name != camera.name:
             notes.append(f"camera {camera.name!r} is called {name} in the capture")
         cameras.append(replace(camera, name=name))
@@ -240,21 +238,10 @@ def _place(clips: Sequence[Path], names: Sequence[str], draft: Path, folder: str
         target = draft / ("images" if images else folder)
         target.mkdir(exist_ok=True)
         if not clip.is_dir():
-            copied |= _link(clip, target / f"{name}{clip.suffix.lower()}")
+            copied |= link_or_copy(clip.resolve(), target / f"{name}{clip.suffix.lower()}")
             continue
         (target / name).mkdir()
         for file in sorted(clip.iterdir()):
             if file.is_file() and file.suffix.lower() in PICTURE_SUFFIXES and not file.name.startswith("."):
-                copied |= _link(file, target / name / file.name)
+                copied |= link_or_copy(file.resolve(), target / name / file.name)
     return copied
-
-
-def _link(original: Path, target: Path) -> bool:
-    """Make a hard link, or a copy if the file system refuses; return whether it is a copy."""
-    original = original.resolve()
-    try:
-        os.link(original, target)
-        return False
-    except OSError:
-        shutil.copy2(original, target)
-        return True
