@@ -94,7 +94,7 @@ _MARKED = {joint: [LANDMARKS.index(name) for name in _MIDDLE.get(joint, (joint,)
 class _Likelihood(NamedTuple):
     """The landmarks' likelihood at B poses."""
 
-    score: Float  # (B,) its negative logarithm
+    score: Float  # (B,) its negative logarithm, if all landmarks were independent
     # (B, L + K, 3, 3), (B, L + K, 3) information about each body point and each bone; and its product with the
     # distance to the landmarks
     information: Float
@@ -183,9 +183,20 @@ class LandmarkCue:
         return LandmarkRows(np.asarray(information), np.asarray(pull), self._skeleton.point_jacobian(poses, SEGMENT, x))
 
     def score(self, poses: Float) -> Float:
-        """Return (B,) the same at poses (B, D), nats, up to a constant of the frame."""
-        likelihood = self._likelihood(self._skeleton.points(poses, SEGMENT, self._place)).score
-        return likelihood + 0.5 * (self._prior * poses**2).sum(axis=-1)
+        """Return (B,) the same at poses (B, D), nats, up to a constant of the frame.
+
+        The offsets are integrated out by Laplace's method, about the offsets that one step of Newton's gives. They
+        explain what all images have in common; a landmark far off in one image is not explained by them.
+        """
+        x = self._skeleton.points(poses, SEGMENT, self._place)
+        found, variance = self._likelihood(x), self._offset[..., : len(LANDMARKS), None]
+        spread = np.eye(3) + variance[..., None] * found.information[:, : len(LANDMARKS)]
+        offset = variance * np.linalg.solve(spread, found.pull[:, : len(LANDMARKS), :, None])[..., 0]
+        moved = self._likelihood(x + offset).score + 0.5 * (offset**2 / variance).sum(axis=(-2, -1))
+        # a step is too long where it leaves a landmark's normal part
+        volume = 0.5 * np.log(np.linalg.det(spread)).sum(axis=-1)
+        likelihood = INDEPENDENT * (np.minimum(moved, found.score) + volume)
+        return np.asarray(likelihood + 0.5 * (self._prior * poses**2).sum(axis=-1))
 
     def variance(self, poses: Float) -> Float:
         """Return (B, J) variance of the joints' positions along an axis, metres², from the distances between poses
@@ -238,11 +249,7 @@ class LandmarkCue:
         a = np.broadcast_to(self._sight, (len(x), *self._sight.shape[-2:]))  # (B, V, 3)
         information = np.concatenate([information, np.einsum("bvk,bvi,bvj->bkij", w_along + w_turned, a, a)], axis=1)
         pull = np.concatenate([pull, np.einsum("bvk,bvi->bki", w_along * along_r + w_turned * turned_r, a)], axis=1)
-        # the offset is shared by the images: V of them count as fewer
-        size = (OFFSET_M / SEEN_M) ** 2
-        seen = np.maximum(np.count_nonzero(self._right, axis=-2).mean(axis=-1), 1.0)
-        shared = (1.0 + size) / (1.0 + seen * size)
-        return _Likelihood(-INDEPENDENT * shared * image_total.sum(axis=-1), information, pull)
+        return _Likelihood(-image_total.sum(axis=-1), information, pull)
 
     def _match(
         self, ray: Float, depth: Float, ahead: NDArray[np.bool_], order: NDArray[np.int64] | None
