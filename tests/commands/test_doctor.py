@@ -50,7 +50,7 @@ def test_only_checks_that_tracking_needs_decide_the_exit_code(tk: Tk, monkeypatc
 @pytest.mark.parametrize(
     ("code", "why"),
     [
-        ("import os; os.abort()", "the process was ended by signal 6; the remedy"),
+        ("import os; os.abort()", "the process was ended by SIGABRT; the remedy"),
         ("import time; time.sleep(60)", "gave no answer for 120 s; the remedy"),
         ("import no_such_package", "ModuleNotFoundError: No module named 'no_such_package'; the remedy"),
     ],
