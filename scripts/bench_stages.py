@@ -145,10 +145,10 @@ def silhouette_stages(
             statistics.median(median_ms(partial(fit, *frame), 3) for frame in zip(poses, pyramids, strict=True)),
             {},
         ),
-        Stage("E_S of a pose", median_ms(lambda: evidence.costs(body, pose)), {}),
+        Stage("E_S of a pose", median_ms(lambda: evidence.mismatch(body, pose)), {}),
         Stage(
             f"E_S of {len(variants)} places of an arm",
-            median_ms(lambda: evidence.costs(body, variants, limb.parts, others)),
+            median_ms(lambda: evidence.mismatch(body, variants, limb.parts, others)),
             {},
         ),
     ]

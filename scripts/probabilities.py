@@ -61,7 +61,7 @@ def choices(tracker: RegionTracker, frame: Frame, views: Sequence[int], truth: n
     rng = np.random.default_rng(frame.index)
     for limb in tracker.limbs:
         tried = limb.candidates(pose, 0, rng)
-        cost = tracker.see(frame).evidence.score(tracker.body, tried)
+        cost = tracker.see(frame).evidence.cost(tracker.body, tried)
         cost[skeleton.apart(tried, skeleton.joints(pose)) < CHOICE_M] = np.inf
         wrong += [("limb elsewhere", one) for one in limb.distinct(tried, cost, ELSEWHERE)]
     for count in views:
@@ -69,7 +69,7 @@ def choices(tracker: RegionTracker, frame: Frame, views: Sequence[int], truth: n
         seen = tracker.see(without_cameras(frame, out), None if out.any() else frame.images)
         starts = np.array([pose, *(one for _, one in wrong)])
         settled = tracker.settle(seen.pyramid, starts, (1, 0), seen.images).states
-        cost = tracker.evidence(tracker.choice, seen.frame, seen.pyramid).score(tracker.body, settled)
+        cost = tracker.evidence(tracker.choice, seen.frame, seen.pyramid).cost(tracker.body, settled)
         error = off(settled).mean(axis=1)
         apart = skeleton.apart(settled, skeleton.joints(settled[0]))
         for (kind, _), more, worse, far in zip(wrong, cost[1:] - cost[0], error[1:] > error[0], apart[1:], strict=True):

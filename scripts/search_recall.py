@@ -59,10 +59,10 @@ class Trials(RegionTracker):
         pyramid, evidence = seen.pyramid, seen.evidence
         pose = self._best.pose
         rng = np.random.default_rng(frame.index)
-        own = float(evidence.costs(self.body, pose[None])[0])
+        own = float(evidence.mismatch(self.body, pose[None])[0])
         for limb in self.limbs:
             places = limb.candidates(pose, 0, rng)
-            cost = evidence.costs(self.body, places)
+            cost = evidence.mismatch(self.body, places)
             allowed = np.flatnonzero((self._off(limb, places, pose) > DISPLACED_M) & (cost < own + ALLOWED))
             for k in rng.choice(allowed, min(TRIES, len(allowed)), replace=False):
                 wrong = self.settle(pyramid, places[k][None], (1, 0), frame.images).states

@@ -133,7 +133,7 @@ def track(data: Sequence3D, name: str, views: int, config: Variant) -> tuple[Row
     error = []
     for i in range(0, len(frames), every):
         pose = estimates[i].pose
-        error.append(Evidence.of(grid, data.masks[i]).costs(body, pose[None])[0])
+        error.append(Evidence.of(grid, data.masks[i]).mismatch(body, pose[None])[0])
     found, true = joints[:, ANKLES], data.truth[:, ANKLES]
     off, height = [], []
     for camera in rig:

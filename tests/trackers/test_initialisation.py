@@ -214,7 +214,7 @@ def test_heading_as_before_is_preferred_where_silhouettes_are_ambiguous(monkeypa
         def __init__(self, nats: float) -> None:
             self.nats = nats
 
-        def score(self, _, poses: np.ndarray) -> np.ndarray:
+        def cost(self, _, poses: np.ndarray) -> np.ndarray:
             return -self.nats * (np.cos(poses[:, yaw] - before[yaw]) < 0)
 
     for gain, turned in ((0.0, False), (DROPPED - 1.0, False), (DROPPED + 1.0, True)):
@@ -244,7 +244,7 @@ def test_landmarks_tell_the_heading_that_silhouettes_leave_open() -> None:
         frame = Frame(0, np.zeros(0, np.uint8), masks, landmarks=seen)
         pyramid = tracker.pyramid(frame)
         assert pyramid.landmarks is not None
-        score = tracker.score(pyramid, tracker.world.poses_in(np.stack([facing, back])))
+        score = tracker.cost(pyramid, tracker.world.poses_in(np.stack([facing, back])))
         assert (score[0] < score[1]) == (pose is facing)
 
 

@@ -152,5 +152,5 @@ def test_landmarks_decide_about_the_opposite_heading() -> None:
     masks = draw_silhouettes(BODY, RIG, np.stack([POSES[0], turned])).max(axis=0)
     assert len(tracker.headings([masks], POSES[:1], None, None)) == 2
     assert tracker.headings([masks], POSES[:1], None, seen_at(POSES[0])) == ()
-    both = [tracker.cost([masks], pose[None], seen_at(turned)) for pose in (POSES[0], turned)]
+    both = [tracker.trajectory_cost([masks], pose[None], seen_at(turned)) for pose in (POSES[0], turned)]
     assert both[1] < both[0] - 10.0

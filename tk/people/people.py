@@ -50,7 +50,7 @@ _HISTORY = 8
 # a start takes seconds. The first attempt often fails, because the person is still partly out of view.
 _LONGEST_PAUSE = 8
 # Least share of the area of a person who is tracked that must be unexplained in two views before a search.
-_UNEXPLAINED = 0.25
+_LEAST_UNEXPLAINED = 0.25
 # Likeness by the colours above which somebody who enters is a person who has left. On pair and a rendered crossing, by
 # colours and body: -0.1 to -0.7 for the same person, -1.6 to -3.7 for the other one.
 _SAME_COLORS = -1.1
@@ -346,7 +346,7 @@ class People:
         """Return the people in the working volume whom the pixels show that no body explains."""
         *areas, unexplained = owners.areas(frame.masks)
         person = max((float(np.median(area)) for area in areas), default=0.0)
-        if np.count_nonzero(unexplained > _UNEXPLAINED * person) < 2:
+        if np.count_nonzero(unexplained > _LEAST_UNEXPLAINED * person) < 2:
             return []
         masks = owners.unknown(frame).masks
         return [p for p in self._finder.find(masks >= PERSON, hidden=masks == OTHERS) if p.inside]

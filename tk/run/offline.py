@@ -223,13 +223,13 @@ class _Finisher:
                 masks.sequence(draft.result.frames), poses, one.lost, residual, height_m, landmarks, True, self.within
             )
             shown, marked = seen(both)
-            return tracker.cost(shown, again[0][both], marked)
+            return tracker.trajectory_cost(shown, again[0][both], marked)
 
         shown, marked = seen(rows)
-        hypotheses = tracker.headings(shown, poses[rows], height_m, marked)
-        if not hypotheses:
+        headings = tracker.headings(shown, poses[rows], height_m, marked)
+        if not headings:
             return tracker
-        present, opposite = hypotheses
+        present, opposite = headings
         _LOG.info("comparing both headings: which way the person faces is unclear")
         turned = np.array([tracker.turned_pose(pose) for pose in poses])
         known = cost(present, poses, draft)

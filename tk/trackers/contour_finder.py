@@ -160,7 +160,7 @@ class ContourFinder:
         seen = self.views.pyramid(empty, 1, False)
         pose = np.zeros((1, len(body.skeleton.names)))
         normal_equations(body.arrays, self.views.at(seen, 0), pose, self.line_search)
-        Evidence.of(self.screen, empty).costs(body, pose)
+        Evidence.of(self.screen, empty).mismatch(body, pose)
 
     # --- initialisation (silhouette paper, section 4.6) ---------------------------------------------------------
 
@@ -256,16 +256,16 @@ class ContourFinder:
             cost = hypothesis.cost
             if len(hypotheses) > 1:
                 self.take_body(body)
-                costs = np.array(list(map(self._converged_score, frames, pyramids, hypothesis.poses)))
+                costs = np.array(list(map(self._converged_cost, frames, pyramids, hypothesis.poses)))
                 cost += float(costs[np.isfinite(costs)].mean())  # infinite in frames without a person
             found.append((cost, body, fitted[0]))
         _, body, pose = min(found, key=lambda one: one[0])
         self.take_body(body)
         return np.asarray(pose)
 
-    def _converged_score(self, frame: Frame, pyramid: Pyramid, pose: Float) -> float:
+    def _converged_cost(self, frame: Frame, pyramid: Pyramid, pose: Float) -> float:
         """Return the cost of the pose that a pose (D,) converges to, nats; uncertain pixels count half."""
-        return float(self.score(pyramid, self.settle(pyramid, pose[None]).states, frame.uncertain)[0])
+        return float(self.cost(pyramid, self.settle(pyramid, pose[None]).states, frame.uncertain)[0])
 
     def fit(
         self,
@@ -365,16 +365,16 @@ class ContourFinder:
         pyramid = pyramid or self.pyramid(frame)
         return Seen(frame, pyramid, self.evidence(self.screen, frame, pyramid), images)
 
-    def score(self, pyramid: Pyramid, poses: Float, uncertain: NDArray[np.bool_] | None = None) -> Float:
+    def cost(self, pyramid: Pyramid, poses: Float, uncertain: NDArray[np.bool_] | None = None) -> Float:
         """Return (B,) the negative logarithm of the likelihood of a frame without colours, nats."""
         evidence = Evidence.of(self.screen, pyramid.masks[0], uncertain, cues=self.cues(pyramid))
-        return evidence.score(self.body, poses)
+        return evidence.cost(self.body, poses)
 
     def mean_residual(self, pyramid: Pyramid, poses: Float, uncertain: NDArray[np.bool_] | None = None) -> Float:
         """Return (B,) E_S, mean over the views that see anybody, inf if none does. A body on ``uncertain`` pixels
         counts half."""
         evidence = Evidence.of(self.screen, pyramid.masks[0], uncertain)
-        return evidence.costs(self.body, poses)
+        return evidence.mismatch(self.body, poses)
 
     def compared(self, seen: Seen, pose: Float, *proposed: Float) -> tuple[Float, Float]:
         """Settle proposed poses (B, D), unless they cost too much for it. Return a pose (D,) and those of them that
@@ -382,12 +382,12 @@ class ContourFinder:
         frame."""
         skeleton, found = self.body.skeleton, np.concatenate(proposed)
         if len(found):
-            cost = seen.evidence.score(self.body, np.concatenate([pose[None], found]))
+            cost = seen.evidence.cost(self.body, np.concatenate([pose[None], found]))
             found = found[cost[1:] + turning(skeleton, found, pose) <= cost[0] + PROPOSED]
         if len(found):
             found = self.settle(seen.pyramid, found, (0,), seen.images).states
         found = np.concatenate([pose[None], found[skeleton.apart(found, skeleton.joints(pose)) > SAME_POSE_M]])
-        cost = self.evidence(self.choice, seen.frame, seen.pyramid).score(self.body, found)
+        cost = self.evidence(self.choice, seen.frame, seen.pyramid).cost(self.body, found)
         return found, cost + turning(skeleton, found, pose)
 
     def best(self, seen: Seen, pose: Float, *proposed: Float) -> Float:

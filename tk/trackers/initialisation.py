@@ -49,7 +49,7 @@ EXCHANGE = 6.0
 WORSE = 1.2
 # A pose with a higher residual explains nothing: twice what an average body of the right stature leaves. Without a
 # better one in any of the frames the person is not found.
-UNEXPLAINED = 0.6
+NOBODY = 0.6
 # Alternatives that are followed through the opening, the likeliest of each anchor first: where nothing fits, each takes
 # seconds. Half and twice as many change no mean error of dance and cube (50 frames).
 FOLLOWED = 8
@@ -84,7 +84,7 @@ def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None 
                 raise
             continue
         least = min(least, residual)
-        if residual > UNEXPLAINED:
+        if residual > NOBODY:
             continue
         turned = np.cos(poses[:, skeleton.index("torso_yaw")] - poses[0, skeleton.index("torso_yaw")]) < 0
         for rank, pose in enumerate(poses[1:]):
@@ -132,7 +132,7 @@ def _find(finder: ContourFinder, seen: Seen) -> tuple[float, Float]:
     found = np.concatenate([found, *both])
     found = found[different(skeleton, found, SAME_START_M)]
     poses = np.array([_searched(finder, seen, pose) for pose in found])
-    cost = seen.evidence.score(finder.body, poses)
+    cost = seen.evidence.cost(finder.body, poses)
     order = np.argsort(cost, kind="stable")
     kept = poses[order[cost[order] < cost.min() + DROPPED]]
     kept = kept[different(skeleton, kept, SAME_START_M)]
@@ -153,7 +153,7 @@ def _follow(
         return finder.mean_residual(seen[i].pyramid, poses, seen[i].frame.uncertain)
 
     residuals[:, anchor] = residual_of(anchor, poses[:, anchor])
-    costs[:, anchor] = seen[anchor].evidence.score(finder.body, poses[:, anchor])
+    costs[:, anchor] = seen[anchor].evidence.cost(finder.body, poses[:, anchor])
     every = finder.search_frames
     for step, end in ((1, F), (-1, -1)):
         for i in range(anchor + step, end, step):
@@ -171,7 +171,7 @@ def _follow(
                 now[b] = finder.improved(seen[i], now[b])
                 residual[b] = residual_of(i, now[b : b + 1])[0]
             poses[:, i], residuals[:, i] = now, residual
-            costs[:, i] = seen[i].evidence.score(finder.body, now)
+            costs[:, i] = seen[i].evidence.cost(finder.body, now)
     means = np.nanmean(costs, axis=1) + walking(skeleton, poses)
     return [TrajectoryHypothesis(one, float(mean)) for one, mean in zip(poses, means, strict=True)]
 
@@ -199,7 +199,7 @@ def stature_of(finder: ContourFinder, pyramids: Sequence[Pyramid]) -> float:
             p_centroid = centroid(finder.views.rig, pyramid, 0)
         except CaptureError:
             continue
-        poses = gait.hypotheses(body.skeleton, 4, 0, p_centroid)  # standing, and the Da Vinci pose
+        poses = gait.figures(body.skeleton, 4, 0, p_centroid)  # standing, and the Da Vinci pose
         evidence = Evidence.of(finder.screen, pyramid.masks[0])
         _, met = evidence.cast(body, poses)
         drawn = met.label > 0 if evidence.others is None else (met.label > 0) & ~evidence.others

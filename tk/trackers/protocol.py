@@ -262,7 +262,7 @@ class TwoPassTracker(Tracker, Protocol):
         """Continue at a pose (D,); forget residuals and hypotheses, keep the body and its colours."""
         ...
 
-    def cost(self, masks: Sequence[NDArray[np.uint8]], poses: Float, landmarks: Float | None) -> float:
+    def trajectory_cost(self, masks: Sequence[NDArray[np.uint8]], poses: Float, landmarks: Float | None) -> float:
         """Return the negative logarithm of the posterior of poses (N, D), mean over the frames, nats: a body that does
         not fit errs in all of them alike.
 

@@ -86,17 +86,17 @@ ANGLE_DEG, TRANSLATION_M = 40.0, 0.3
 # Masks are searched for carried objects if this share of their pixels has colours that are not the person's; objects
 # narrower than six pixels are ignored.
 FOREIGN_SHARE = 0.01
-# A limb is misplaced if its rays cost more than this, on average. In the development captures no limb within 15 cm of
-# the ground truth costs 0.25, and most others cost 0.3 to 0.4.
+# A limb is misplaced if the mean mismatch of its rays is larger. In the development captures no limb within 15 cm of
+# the ground truth has 0.25, and most others have 0.3 to 0.4.
 MISPLACED = 0.25
 # Limbs are searched for in every second frame if this share of the body's rays meets pixels of other people: a hidden
 # limb has no contour to follow, and appears elsewhere. With 0.1 and 0.2 the limbs of seven people in four rendered
 # scenes are on average 0.3 and 0.4 cm worse; a search in every frame changes the mean of 13 people by 0.1 cm. Where the
-# pose explains the frame as well as others, nothing can be found: the residual must be UNEXPLAINED spreads above its
+# pose explains the frame as well as others, nothing can be found: the residual must be DOUBTFUL spreads above its
 # mean. 62 of 142 searches in four scenes are below, and 3 of the 21 that changed a limb by more than 0.3 cm. Without a
 # limit, with 0.5 and with 1 the limbs of twelve people are 1.58, 1.57 and 1.54 cm off on average; with 1, those of one
 # of two people who circle each other before four cameras without an empty scene are 0.5 cm worse.
-HIDDEN, SEARCH_HIDDEN, UNEXPLAINED = 0.02, 2, 0.5
+HIDDEN, SEARCH_HIDDEN, DOUBTFUL = 0.02, 2, 0.5
 
 
 class _Look(NamedTuple):
@@ -203,15 +203,15 @@ class RegionTracker(ContourTracker[RegionState]):
         inside = turned(self.world.poses_in(pose[None])[0], self.limbs)
         return np.asarray(self.world.poses_out(inside[None])[0])
 
-    def cost(self, masks: Sequence[NDArray[np.uint8]], poses: Float, landmarks: Float | None) -> float:
+    def trajectory_cost(self, masks: Sequence[NDArray[np.uint8]], poses: Float, landmarks: Float | None) -> float:
         """See :class:`~tk.trackers.protocol.TwoPassTracker`."""
         inside = self.world.poses_in(poses)
         seen = self._pyramids(masks, landmarks)
-        cost = np.mean([self.score(pyramid, pose[None])[0] for pyramid, pose in zip(seen, inside, strict=True)])
+        cost = np.mean([self.cost(pyramid, pose[None])[0] for pyramid, pose in zip(seen, inside, strict=True)])
         return float(cost + walking(self.body.skeleton, inside))
 
     def _pyramids(self, masks: Sequence[NDArray[np.uint8]], landmarks: Float | None) -> list[Pyramid]:
-        """Return the silhouettes and landmarks of frames, arguments as for :meth:`cost`."""
+        """Return the silhouettes and landmarks of frames, arguments as for :meth:`trajectory_cost`."""
         known = [None] * len(masks) if landmarks is None else [x if np.isfinite(x).any() else None for x in landmarks]
         return [self.views.pyramid(m, self.solver.scales, False, x) for m, x in zip(masks, known, strict=True)]
 
@@ -224,7 +224,7 @@ class RegionTracker(ContourTracker[RegionState]):
             self.settle(pyramid, np.stack([pose, turned(pose, self.limbs)])).states
             for pyramid, pose in zip(seen, inside, strict=True)
         ])  # fmt: skip
-        present, opposite = (np.mean(list(map(self.score, seen, one[:, None]))) for one in both.swapaxes(0, 1))
+        present, opposite = (np.mean(list(map(self.cost, seen, one[:, None]))) for one in both.swapaxes(0, 1))
         if opposite > present + PROPOSED:
             return ()
         for i, (shown, pyramid) in enumerate(zip(masks, seen, strict=True)):
@@ -236,7 +236,7 @@ class RegionTracker(ContourTracker[RegionState]):
         for tracker, one in zip(trackers, both.swapaxes(0, 1), strict=True):
             fitted = self.fit(seen, one, np.arange(len(seen)), stature, deviation)
             tracker.take_body(fitted.body)
-            costs.append(tracker.cost(masks, self.world.poses_out(fitted.poses), landmarks))
+            costs.append(tracker.trajectory_cost(masks, self.world.poses_out(fitted.poses), landmarks))
         return trackers if costs[1] < costs[0] + DROPPED else ()
 
     def step(self, frame: Frame) -> Estimate:
@@ -254,13 +254,13 @@ class RegionTracker(ContourTracker[RegionState]):
             pyramid, starts, levels, seen.images, self.prior(starts), solver=solver
         )
         watch.lap("optimise")
-        cost, met = evidence.cast(self.body, poses)
-        if not np.isfinite(cost).all():
+        mismatch, met = evidence.cast(self.body, poses)
+        if not np.isfinite(mismatch).all():
             return self._nobody(frame, watch)
-        nats = evidence.nats(cost, poses)
+        costs = evidence.cost_of(mismatch, poses)
         self._alive = [
             Hypothesis(pose, h.pose, h.cost + RENEWAL * (c - h.cost) if h.age else float(c), h.age + 1)
-            for h, pose, c in zip(self._alive, poses, nats, strict=True)
+            for h, pose, c in zip(self._alive, poses, costs, strict=True)
         ]
         self._rank()
         i = int(np.argmin([np.abs(pose - self._best.pose).max() for pose in poses]))
@@ -411,9 +411,9 @@ class RegionTracker(ContourTracker[RegionState]):
 
     def misplaced(self, evidence: Evidence, label: NDArray[np.uint8]) -> tuple[Limb, ...]:
         """Return the limbs of which a large part lies outside the mask, or on colours that are not theirs."""
-        cost, count = evidence.cost_of_parts(self.body, label)
+        mismatch, count = evidence.mismatch_of_parts(self.body, label)
         return tuple(
-            limb for limb in self.limbs if cost[limb.parts].sum() > MISPLACED * max(count[limb.parts].sum(), 1)
+            limb for limb in self.limbs if mismatch[limb.parts].sum() > MISPLACED * max(count[limb.parts].sum(), 1)
         )
 
     def _needs_search(self, frame: Frame, look: _Look, misplaced: Sequence[Limb], hidden: float) -> bool:
@@ -422,7 +422,7 @@ class RegionTracker(ContourTracker[RegionState]):
         if misplaced or self.residuals.high(look.error):
             return True
         every = self.search_frames
-        doubtful = hidden > HIDDEN and self.residuals.mean_excess(look.error) > UNEXPLAINED
+        doubtful = hidden > HIDDEN and self.residuals.mean_excess(look.error) > DOUBTFUL
         return every > 0 and (frame.index % every == 0 or (doubtful and frame.index % SEARCH_HIDDEN == 0))
 
     def _choose(self, seen: Seen, *proposed: Float, again: bool = False) -> bool:

@@ -315,7 +315,7 @@ class SecondPass:
 
     def _costs(self, pyramid: Pyramid, poses: Float) -> Float:
         """Return the costs (B,) of poses (B, D) by masks and landmarks, nats."""
-        return self.tracker.score(pyramid, poses)
+        return self.tracker.cost(pyramid, poses)
 
 
 def second_of_two(cost: Float, steps: Float) -> Float:

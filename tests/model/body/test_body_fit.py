@@ -208,7 +208,9 @@ def test_shapes_are_recovered_as_mirror_images():
     grid = RayGrid(VIEWS.rig, 150)
 
     def error(body, poses):
-        return np.mean([Evidence.of(grid, p.masks[0]).costs(body, q[None]) for p, q in zip(seen, poses, strict=True)])
+        return np.mean(
+            [Evidence.of(grid, p.masks[0]).mismatch(body, q[None]) for p, q in zip(seen, poses, strict=True)]
+        )
 
     assert error(found, fitted) < 0.6 * error(AVERAGE, poses)
     parts = {part.name: part for part in found.parts}

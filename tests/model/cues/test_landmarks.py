@@ -93,7 +93,7 @@ def test_score_is_that_with_offsets_integrated_out() -> None:
     seen = landmarks_of(RIG, BODY, POSE, 0.01, visibility=1.0, with_depth=False)
     near = POSE + np.random.default_rng(2).normal(0.0, 0.01, len(POSE))
     poses = np.stack([POSE, near])
-    cost, turns = LandmarkCue(RIG, BODY, seen).score(poses), BODY.skeleton.by_landmarks
+    cost, turns = LandmarkCue(RIG, BODY, seen).cost(poses), BODY.skeleton.by_landmarks
     cost -= 0.5 * (turns**-2.0 * poses**2).sum(axis=1)
     expected = marginal_cost(near, seen) - marginal_cost(POSE, seen)
     assert cost[1] - cost[0] == pytest.approx(expected, rel=0.1)
@@ -104,9 +104,9 @@ def test_landmark_far_off_in_one_image_counts_as_much_as_if_the_image_were_alone
     cost = []
     for views in ([0], [0, 1, 2, 3]):
         rig, seen = Rig(tuple(RIG[v] for v in views)), SEEN[views].copy()
-        right = LandmarkCue(rig, BODY, seen).score(POSE[None])[0]
+        right = LandmarkCue(rig, BODY, seen).cost(POSE[None])[0]
         seen[0, LANDMARKS.index("wrist_l"), :2] += 40.0  # pixels, over a metre
-        cost.append(LandmarkCue(rig, BODY, seen).score(POSE[None])[0] - right)
+        cost.append(LandmarkCue(rig, BODY, seen).cost(POSE[None])[0] - right)
     assert cost[1] == pytest.approx(cost[0], rel=0.3)
 
 
@@ -127,14 +127,14 @@ def test_depth_shows_whether_a_forearm_points_at_the_camera_or_away_from_it() ->
         for right in (0, 1):
             seen = landmarks_of(RIG, BODY, both[right], with_depth=with_depth)
             seen[1:] = np.nan
-            right_cost, other_cost = LandmarkCue(RIG, BODY, seen).score(both)[[right, 1 - right]]
+            right_cost, other_cost = LandmarkCue(RIG, BODY, seen).cost(both)[[right, 1 - right]]
             assert (other_cost - right_cost > 1.5) == with_depth
 
 
 def test_unknown_depth_changes_nothing_and_depth_moves_left_and_right_with_the_landmarks() -> None:
     seen = landmarks_of(RIG, BODY, POSE, 0.01, with_depth=True)
     exchanged, pose = mirrored(seen), POSE[None]
-    own, other = (LandmarkCue(RIG, BODY, each).score(pose)[0] for each in (seen, exchanged))
+    own, other = (LandmarkCue(RIG, BODY, each).cost(pose)[0] for each in (seen, exchanged))
     # an exchange in all images costs its probability, and no more
     assert other - own < INDEPENDENT * 2 * len(RIG) * np.log((1 - EXCHANGED) / EXCHANGED) + 1e-6
     seen[..., 3] = np.nan
@@ -151,7 +151,7 @@ def test_head_turns_to_where_the_face_is_seen_and_is_straight_without_it() -> No
     cue, precision = LandmarkCue(RIG, BODY, seen), BODY.skeleton.by_landmarks[turn] ** -2.0
     matrix = cue.normal(pose[None]).matrix[0, turn]
     np.testing.assert_array_equal(matrix, precision * (np.arange(len(pose)) == turn))
-    straight, turned_head = cue.score(np.stack([POSE, pose]))
+    straight, turned_head = cue.cost(np.stack([POSE, pose]))
     assert turned_head - straight == pytest.approx(0.5 * precision * pose[turn] ** 2)
     assert propose(RIG, BODY, seen, POSE[:3])[0][turn] == pytest.approx(0.0, abs=1e-3)
 
@@ -171,7 +171,7 @@ def test_landmarks_of_several_frames_are_compared_with_their_own_poses() -> None
     both = LandmarkCue(RIG, BODY, seen)
     for k, pose in enumerate(poses):
         alone = LandmarkCue(RIG, BODY, seen[k])
-        np.testing.assert_allclose(both.score(poses)[k], alone.score(pose[None])[0])
+        np.testing.assert_allclose(both.cost(poses)[k], alone.cost(pose[None])[0])
         for one, other in zip(both.normal(poses), alone.normal(pose[None]), strict=True):
             np.testing.assert_allclose(one[k], other[0], rtol=1e-9, atol=1e-6)
 
@@ -180,7 +180,7 @@ def test_unknown_landmarks_say_nothing() -> None:
     nothing = LandmarkCue(RIG, BODY, np.full(SEEN.shape, np.nan))
     found = nothing.normal(POSE[None])
     assert not found.matrix.any() and not found.linear.any()
-    assert np.ptp(nothing.score(np.stack([POSE, TURNED]))) == 0.0
+    assert np.ptp(nothing.cost(np.stack([POSE, TURNED]))) == 0.0
 
 
 # --- the choice between poses -------------------------------------------------------------------------------------
@@ -189,7 +189,7 @@ def test_unknown_landmarks_say_nothing() -> None:
 def test_score_is_lowest_at_the_true_pose() -> None:
     rng = np.random.default_rng(4)
     others = POSE + rng.choice([-0.15, 0.15], (40, len(POSE)))
-    score = LandmarkCue(RIG, BODY, NOISY).score(np.concatenate([POSE[None], others]))
+    score = LandmarkCue(RIG, BODY, NOISY).cost(np.concatenate([POSE[None], others]))
     assert (score[0] < score[1:] - 5.0).all()
 
 
@@ -197,7 +197,7 @@ def test_score_is_lowest_at_the_true_pose() -> None:
 def test_true_heading_is_preferred_to_the_opposite_one(views: list[int]) -> None:
     seen = NOISY.copy()
     seen[[v for v in range(len(RIG)) if v not in views]] = np.nan
-    score = LandmarkCue(RIG, BODY, seen).score(np.stack([POSE, TURNED]))
+    score = LandmarkCue(RIG, BODY, seen).cost(np.stack([POSE, TURNED]))
     assert score[1] - score[0] > 5.0
 
 
@@ -205,7 +205,7 @@ def test_exchanged_sides_in_one_image_cost_no_more_than_their_prior() -> None:
     poses = np.stack([POSE, TURNED])
     spoilt = NOISY.copy()
     spoilt[1] = mirrored(NOISY[1])
-    right, wrong = (LandmarkCue(RIG, BODY, seen).score(poses) for seen in (NOISY, spoilt))
+    right, wrong = (LandmarkCue(RIG, BODY, seen).cost(poses) for seen in (NOISY, spoilt))
     assert 0 < wrong[0] - right[0] <= 2 * INDEPENDENT * np.log((1 - EXCHANGED) / EXCHANGED) + 0.01
     assert wrong[1] - wrong[0] > 5.0  # the other images show the heading
 
@@ -214,7 +214,7 @@ def test_exchanged_sides_in_one_image_cost_no_more_than_their_prior() -> None:
 def test_one_half_is_exchanged_without_the_other(half: str) -> None:
     spoilt = NOISY.copy()
     spoilt[1] = mirrored(NOISY[1], lower=half == "lower", upper=half == "upper")
-    right, wrong = (LandmarkCue(RIG, BODY, seen).score(POSE[None])[0] for seen in (NOISY, spoilt))
+    right, wrong = (LandmarkCue(RIG, BODY, seen).cost(POSE[None])[0] for seen in (NOISY, spoilt))
     assert 0 < wrong - right <= INDEPENDENT * np.log((1 - EXCHANGED) / EXCHANGED) + 0.01
 
 
@@ -226,9 +226,9 @@ def test_image_that_shows_somebody_else_has_bounded_cost_and_no_pull() -> None:
         beside[:2] += away_m
         spoilt[0] = landmarks_of(RIG, BODY, beside)[0]
         found = LandmarkCue(RIG, BODY, spoilt)
-        scores.append(found.score(POSE[None])[0])
+        scores.append(found.cost(POSE[None])[0])
         pulls.append(found.normal(POSE[None]))
-        settled = found.score(np.stack([POSE, beside]))
+        settled = found.cost(np.stack([POSE, beside]))
         assert settled[0] < settled[1]
     assert scores[2] - scores[0] < 1.0
     without = NOISY.copy()
@@ -260,7 +260,7 @@ def test_proposed_poses_are_sorted_and_ignore_an_image_that_shows_somebody_else(
     seen[0, :, :2] += 80.0
     found = propose(RIG, BODY, seen, POSE[:3])
     assert np.linalg.norm(BODY.skeleton.joints(found[0]) - BODY.skeleton.joints(POSE), axis=1).mean() < 0.06
-    scores = LandmarkCue(RIG, BODY, seen).score(found)
+    scores = LandmarkCue(RIG, BODY, seen).cost(found)
     assert (np.diff(scores) >= 0).all()
 
 

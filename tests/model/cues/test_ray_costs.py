@@ -51,7 +51,7 @@ def test_without_colors_the_cost_is_the_papers_error():
     missing = np.count_nonzero(outside, axis=(1, 2)) / np.count_nonzero(MASKS, axis=(1, 2))
     np.testing.assert_allclose(residual[:, 0], missing, atol=1e-12)
     np.testing.assert_allclose(mean, expected.mean(axis=1), atol=1e-6)
-    np.testing.assert_array_equal(mean, evidence.costs(BODY, POSES))
+    np.testing.assert_array_equal(mean, evidence.mismatch(BODY, POSES))
 
 
 def test_coarse_grid_gives_nearly_the_same_cost():
@@ -68,7 +68,7 @@ def test_view_without_a_person_does_not_count():
     assert np.isnan(evidence.residual(met.label[0])[:, 0]).tolist() == [False, True, False]
     np.testing.assert_allclose(mean, total[:, [0, 2]].mean(axis=1))
     nobody = Evidence.of(FINE, 0 * masks)
-    assert np.isnan(by_view(nobody)).all() and np.isinf(nobody.costs(BODY, POSES)).all()
+    assert np.isnan(by_view(nobody)).all() and np.isinf(nobody.mismatch(BODY, POSES)).all()
 
 
 def test_uncertain_pixels_halve_the_cost_outside_the_mask():

@@ -25,7 +25,7 @@ class Cue(Protocol):
         """Return the negative logarithm of the likelihood as a quadratic about each pose, nats."""
         ...
 
-    def score(self, poses: Float) -> Float:
+    def cost(self, poses: Float) -> Float:
         """Return (B,) the negative logarithm of the likelihood, nats, up to a constant of the frame."""
         ...
 

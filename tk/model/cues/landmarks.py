@@ -94,7 +94,7 @@ _MARKED = {joint: [LANDMARKS.index(name) for name in _MIDDLE.get(joint, (joint,)
 class _Likelihood(NamedTuple):
     """The landmarks' likelihood at B poses."""
 
-    score: Float  # (B,) its negative logarithm, if all landmarks were independent
+    cost: Float  # (B,) its negative logarithm, if all landmarks were independent
     # (B, L + K, 3, 3), (B, L + K, 3) information about each body point and each bone; and its product with the
     # distance to the landmarks
     information: Float
@@ -182,7 +182,7 @@ class LandmarkCue:
         pull = INDEPENDENT * np.linalg.solve(spread, found.pull[..., None])[..., 0]
         return LandmarkRows(np.asarray(information), np.asarray(pull), self._skeleton.point_jacobian(poses, SEGMENT, x))
 
-    def score(self, poses: Float) -> Float:
+    def cost(self, poses: Float) -> Float:
         """Return (B,) the same at poses (B, D), nats, up to a constant of the frame.
 
         The offsets are integrated out by Laplace's method, about the offsets that one step of Newton's gives. They
@@ -192,10 +192,10 @@ class LandmarkCue:
         found, variance = self._likelihood(x), self._offset[..., : len(LANDMARKS), None]
         spread = np.eye(3) + variance[..., None] * found.information[:, : len(LANDMARKS)]
         offset = variance * np.linalg.solve(spread, found.pull[:, : len(LANDMARKS), :, None])[..., 0]
-        moved = self._likelihood(x + offset).score + 0.5 * (offset**2 / variance).sum(axis=(-2, -1))
+        moved = self._likelihood(x + offset).cost + 0.5 * (offset**2 / variance).sum(axis=(-2, -1))
         # a step is too long where it leaves a landmark's normal part
         volume = 0.5 * np.log(np.linalg.det(spread)).sum(axis=-1)
-        likelihood = INDEPENDENT * (np.minimum(moved, found.score) + volume)
+        likelihood = INDEPENDENT * (np.minimum(moved, found.cost) + volume)
         return np.asarray(likelihood + 0.5 * (self._prior * poses**2).sum(axis=-1))
 
     def variance(self, poses: Float) -> Float:
@@ -355,7 +355,7 @@ def propose(rig: Rig, body: ConeBody, seen: Float, p_near: Float) -> Float:
         cost = LandmarkCue(rig, body, seen, widened).normal(poses) + prior
         step = np.linalg.solve(cost.matrix, cost.linear[..., None])[..., 0] - poses
         poses = skeleton.clip(poses + np.clip(step, -LONGEST_STEP, LONGEST_STEP))
-    return np.asarray(poses[np.argsort(LandmarkCue(rig, body, seen).score(poses), kind="stable")])
+    return np.asarray(poses[np.argsort(LandmarkCue(rig, body, seen).cost(poses), kind="stable")])
 
 
 def of_person(landmarks: Float | None, masks: NDArray[np.uint8]) -> Float | None:

@@ -1,8 +1,8 @@
-"""Costs of a frame on a grid of rays, for every part of the body that a ray could hit.
+"""How a frame contradicts poses, on a grid of rays, for every part of the body that a ray could hit.
 
-A ray through the mask that hits no part costs 1, and so does a ray that hits a part outside the mask; half of that
-where the mask is uncertain. A ray through the mask that hits a part costs the mismatch of its colour with that part.
-Costs are shares of the person's rays, averaged over the views: without colours the cost is E_S of the silhouette paper
+A ray through the mask that hits no part has a mismatch of 1, and so has a ray that hits a part outside the mask; half
+of that where the mask is uncertain. A ray through the mask that hits a part has the mismatch of its colour with that
+part. The mismatch of a pose is the share of the person's rays, mean over the views: without colours E_S of the paper
 (eq. 12).
 """
 
@@ -32,11 +32,12 @@ COLOR_COST = 0.4
 # Cost of a part on a pixel outside the mask that is uncertain (a shadow, or clothes of the background's colour): both
 # values are equally likely.
 UNCERTAIN_COST = 0.5
-# Negative logarithm of a likelihood for a view's cost of 1. With four views a cost of 0.004 is then one nat: the least
-# gain that replaced a pose when costs were shares. Not yet calibrated by the share of right choices.
+# Negative logarithm of the likelihood for a mismatch of 1 in a view. With four views 0.004 is then one nat. The
+# probabilities of choices that follow are right or too cautious (docs/experiments.md).
 VIEW_NATS = 60.0
-# Costs of a view are divided by the number of the person's rays. Where others hide most of the person, the divisor is
-# at least this share of the largest number in any view, so that a hand beside a back counts less than a person.
+# The mismatch of a view is divided by the number of the person's rays. Where others hide most of the person, the
+# divisor is at least this share of the largest number in any view, so that a hand beside a back counts less than a
+# person.
 # Chosen on pair. With one person (dance and cube, 50 frames) half and twice the value change no mean error.
 LEAST_SEEN = 0.25
 
@@ -81,20 +82,20 @@ class RayGrid:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Costs of one frame on one grid.
+    """What one frame shows on one grid of rays.
 
     Attributes:
         grid: rays of the V views.
         person: (V, h, w) bool, the mask.
-        others: (V, h, w) bool, pixels of other people, where a body costs nothing; None if there are none.
-        cost: (V, h, w, G + 1) float32, see :mod:`tk.kernels.raycast`.
+        others: (V, h, w) bool, pixels of other people, where a body has no mismatch; None if there are none.
+        rays: (V, h, w, G + 1) float32, mismatch of each ray, see :mod:`tk.kernels.raycast`.
         bins: (V, h, w) bin of each ray's colour; None without colours.
         cues: what else was measured of the person in the frame.
     """
 
     grid: RayGrid
     person: NDArray[np.bool_]
-    cost: NDArray[np.float32]
+    rays: NDArray[np.float32]
     bins: NDArray[np.int32] | None
     others: NDArray[np.bool_] | None = None
     cues: Sequence[Cue] = ()
@@ -108,7 +109,7 @@ class Evidence:
         colors: PartColors | None = None,
         cues: Sequence[Cue] = (),
     ) -> Evidence:
-        """Return the costs from masks (V, H, W), uncertain pixels, images, the learned colours of the parts, and
+        """Return the evidence of masks (V, H, W), uncertain pixels, images, the learned colours of the parts, and
         other cues."""
         sampled = grid.sample(masks)
         person, others = sampled >= PERSON, sampled == OTHERS
@@ -118,15 +119,15 @@ class Evidence:
         shared = bool(others.any())
         if shared:
             outside[others] = 0.0
-        cost = np.empty((*person.shape, len(COLOR_GROUPS) + 1), np.float32)
-        cost[..., 0] = person
-        cost[..., 1:] = np.where(person, 0.0, outside)[..., None]
+        rays = np.empty((*person.shape, len(COLOR_GROUPS) + 1), np.float32)
+        rays[..., 0] = person
+        rays[..., 1:] = np.where(person, 0.0, outside)[..., None]
         bins = None if images is None or images.size == 0 else color_bins(grid.sample(images))
         if bins is not None and colors is not None and colors.known:
-            cost[person, 1:] = COLOR_COST * colors.mismatch[bins[person]]
-        return Evidence(grid, person, cost, bins, others if shared else None, cues)
+            rays[person, 1:] = COLOR_COST * colors.mismatch[bins[person]]
+        return Evidence(grid, person, rays, bins, others if shared else None, cues)
 
-    def costs(
+    def mismatch(
         self,
         body: ConeBody,
         poses: Float,
@@ -134,14 +135,15 @@ class Evidence:
         before: Cast | None = None,
         most_outside: float = np.inf,
     ) -> Float:
-        """Return (B,) the cost of the rays at poses (B, D), mean over the views that see anybody; inf if none does.
+        """Return (B,) the share of the rays that contradict poses (B, D), mean over the views that see anybody; inf if
+        none does.
 
         ``drawn``, ``before`` and ``most_outside`` as in :func:`tk.kernels.raycast.costs`.
         """
-        total = costs(body.arrays, self.grid.packed, self.cost, poses, drawn, before, most_outside)
+        total = costs(body.arrays, self.grid.packed, self.rays, poses, drawn, before, most_outside)
         return mean_of_views(self.shares(total))
 
-    def score(
+    def cost(
         self,
         body: ConeBody,
         poses: Float,
@@ -150,22 +152,21 @@ class Evidence:
         most_outside: float = np.inf,
     ) -> Float:
         """Return (B,) the negative logarithm of the likelihood at poses (B, D), nats, up to a constant of the frame;
-        arguments as for :meth:`costs`."""
-        return self.nats(self.costs(body, poses, drawn, before, most_outside), poses)
+        arguments as for :meth:`mismatch`."""
+        return self.cost_of(self.mismatch(body, poses, drawn, before, most_outside), poses)
 
-    def nats(self, cost: Float, poses: Float) -> Float:
-        """Return :meth:`score` of poses (B, D) whose rays have :meth:`costs` (B,)."""
+    def cost_of(self, mismatch: Float, poses: Float) -> Float:
+        """Return :meth:`cost` of poses (B, D) with a :meth:`mismatch` (B,)."""
         views = max(int(np.count_nonzero(self._seen)), 1)
-        return np.asarray(VIEW_NATS * views * cost + sum(cue.score(poses) for cue in self.cues))
+        return np.asarray(VIEW_NATS * views * mismatch + sum(cue.cost(poses) for cue in self.cues))
 
     def cast(self, body: ConeBody, poses: Float, drawn: NDArray[np.int32] | None = None) -> tuple[Float, Cast]:
-        """Return the cost (B,) of the rays, mean over the views that see anybody, inf if none does; and the parts that
-        the rays meet."""
-        total, met = cast(body.arrays, self.grid.packed, self.cost, poses, drawn)
+        """Return the :meth:`mismatch` (B,) of poses, and the parts that the rays meet."""
+        total, met = cast(body.arrays, self.grid.packed, self.rays, poses, drawn)
         return mean_of_views(self.shares(total)), met
 
     def shares(self, total: Float) -> Float:
-        """Return sums of costs (B, V) as shares of the person's rays; NaN where a view sees nobody."""
+        """Return sums of mismatches (B, V) as shares of the person's rays; NaN where a view sees nobody."""
         seen = self._seen
         return np.where(seen > 0, total / np.maximum(seen, 1), np.nan)
 
@@ -178,14 +179,14 @@ class Evidence:
         """Return (V, 2) missing and surplus area of a rendered body, labels (V, h, w), see :func:`residual_of`."""
         return residual_of(label > 0, self.person, self.others)
 
-    def cost_of_parts(self, body: ConeBody, label: NDArray[np.uint8]) -> tuple[Float, NDArray[np.int64]]:
-        """Return the summed cost (P,) and the number (P,) of the rays that hit each part, labels (V, h, w).
+    def mismatch_of_parts(self, body: ConeBody, label: NDArray[np.uint8]) -> tuple[Float, NDArray[np.int64]]:
+        """Return the summed mismatch (P,) and the number (P,) of the rays that hit each part, labels (V, h, w).
 
         Views that see nobody do not count.
         """
         met = (label > 0) & np.asarray(self.person.any(axis=(1, 2)))[:, None, None]
         part = label[met].astype(np.int64) - 1
-        cost = self.cost[met, body.color_group[part] + 1]
+        cost = self.rays[met, body.color_group[part] + 1]
         parts = len(body.parts)
         total, count = np.bincount(part, cost, parts), np.bincount(part, minlength=parts)
         return total.astype(np.float64), count.astype(np.int64)

@@ -42,7 +42,7 @@ def propose(finder: ContourFinder, seen: Seen, pose: Float | None = None) -> Flo
     skeleton, pyramid = finder.body.skeleton, seen.pyramid
     p_centroid = centroid(finder.views.rig, pyramid, seen.frame.index)
     yaw = skeleton.index("torso_yaw")
-    poses = gait.hypotheses(skeleton, HEADINGS, PHASES, p_centroid, 0.0 if pose is None else pose[yaw])
+    poses = gait.figures(skeleton, HEADINGS, PHASES, p_centroid, 0.0 if pose is None else pose[yaw])
     if pose is not None:
         moved = pose.copy()
         moved[skeleton.prismatic] = p_centroid
@@ -50,7 +50,7 @@ def propose(finder: ContourFinder, seen: Seen, pose: Float | None = None) -> Flo
     scales = range(finder.solver.scales - 1, -1, -1)
     for levels, share in ((scales[:1], REFINED), (scales[1:], 1)):
         poses = finder.settle(pyramid, poses, levels).states
-        order = np.argsort(seen.evidence.score(finder.body, poses), kind="stable")
+        order = np.argsort(seen.evidence.cost(finder.body, poses), kind="stable")
         poses = poses[order[: -(-len(poses) // share)]]
     return np.asarray(poses[different(skeleton, poses, SAME_START_M)[:FINALISTS]])
 

@@ -60,23 +60,23 @@ def modes(finder: ContourFinder, seen: Seen, pose: Float, misplaced: Sequence[Li
     body, evidence = finder.body, seen.evidence
     skeleton = body.skeleton
     rng = np.random.default_rng([7, seen.frame.index, finder.seed])
-    cost, met = evidence.cast(body, pose[None])
-    own, surplus = float(evidence.nats(cost, pose[None])[0]), evidence.surplus(met.label[0])
+    mismatch, met = evidence.cast(body, pose[None])
+    own, surplus = float(evidence.cost_of(mismatch, pose[None])[0]), evidence.surplus(met.label[0])
     joints = skeleton.joints(pose)
     found = []
     for limb in finder.limbs:
-        if limb not in misplaced and evidence.cast(body, pose[None], limb.still)[0][0] - cost[0] > surplus:
+        if limb not in misplaced and evidence.cast(body, pose[None], limb.still)[0][0] - mismatch[0] > surplus:
             continue  # what is beyond elbow or knee covers more than the surplus area that it could cover elsewhere
         _, rest = evidence.cast(body, pose[None], limb.rest)
         before = Cast(rest.label[0].copy(), rest.depth[0].copy())
         tried = limb.candidates(pose, NEARBY, rng)
-        screened = evidence.score(body, tried, limb.parts, before, most_outside=OUTSIDE)
+        screened = evidence.cost(body, tried, limb.parts, before, most_outside=OUTSIDE)
         screened[screened > own + PROPOSED] = np.inf
         chosen = limb.distinct(tried, screened, MORE_CANDIDATES if limb in misplaced else CANDIDATES)
         if not len(chosen):
             continue
         settled = finder.settle(seen.pyramid, chosen, (finder.search_level,), seen.images, limb=limb).states
-        more = evidence.score(body, settled, limb.parts, before) - own
+        more = evidence.cost(body, settled, limb.parts, before) - own
         kept = np.argsort(more, kind="stable")
         kept = kept[(more[kept] < DROPPED) & (skeleton.apart(settled[kept], joints) > SAME_POSE_M)]
         found.append(Modes(limb, settled[kept], more[kept]))
@@ -99,7 +99,7 @@ def propose(finder: ContourFinder, seen: Seen, pose: Float, found: Sequence[Mode
             both[dofs] = second[0][dofs]
             result.append(both)
     poses = np.array(result).reshape(-1, len(pose))
-    return poses[np.argsort(seen.evidence.score(finder.body, poses), kind="stable")[:FINISHED]] if result else poses
+    return poses[np.argsort(seen.evidence.cost(finder.body, poses), kind="stable")[:FINISHED]] if result else poses
 
 
 def spread(skeleton: Skeleton, pose: Float, before: Float, found: Sequence[Modes]) -> Float:
