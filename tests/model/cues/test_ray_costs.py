@@ -27,7 +27,7 @@ MASKS = DRAWN[0]
 
 
 def by_view(evidence, poses=POSES):
-    return evidence.shares(costs(BODY.arrays, evidence.grid.packed, evidence.cost, poses))
+    return evidence.shares(costs(BODY.arrays, evidence.grid.packed, evidence.rays, poses))
 
 
 def test_grids_sample_the_middle_of_their_squares():

@@ -7,7 +7,7 @@ from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
-from tk.model.body.gait_poses import hip_and_knee, hypotheses, walking_pose
+from tk.model.body.gait_poses import figures, hip_and_knee, walking_pose
 from tk.model.cues.ray_costs import pixel_rays
 from tk.model.masks.silhouettes import Views, clean, share_wrong
 
@@ -63,7 +63,7 @@ def test_rays_go_through_the_pixels():
 
 
 def test_hypotheses_cover_headings_and_phases():
-    poses = hypotheses(BODY.skeleton, 4, 3, np.array([1.0, 2, 3]))
+    poses = figures(BODY.skeleton, 4, 3, np.array([1.0, 2, 3]))
     assert poses.shape == (4 * (3 + 2), len(BODY.skeleton.names))
     assert (poses[:, :3] == [1, 2, 3]).all()
     assert len(np.unique(poses.round(6), axis=0)) == len(poses)
