@@ -193,10 +193,10 @@ class LandmarkCue:
         spread = np.eye(3) + variance[..., None] * found.information[:, : len(LANDMARKS)]
         offset = variance * np.linalg.solve(spread, found.pull[:, : len(LANDMARKS), :, None])[..., 0]
         moved = self._likelihood(x + offset).cost + 0.5 * (offset**2 / variance).sum(axis=(-2, -1))
-        # a step is too long where it leaves a landmark's normal part
         volume = 0.5 * np.log(np.linalg.det(spread)).sum(axis=-1)
-        likelihood = INDEPENDENT * (np.minimum(moved, found.cost) + volume)
-        return np.asarray(likelihood + 0.5 * (self._prior * poses**2).sum(axis=-1))
+        # where the step leaves a landmark's normal part, it is too long, and no offset is better
+        cost = INDEPENDENT * (np.minimum(moved, found.cost) + volume)
+        return np.asarray(cost + 0.5 * (self._prior * poses**2).sum(axis=-1))
 
     def variance(self, poses: Float) -> Float:
         """Return (B, J) variance of the joints' positions along an axis, metres², from the distances between poses
