@@ -50,6 +50,9 @@ class SearchSettings:
     # there, and most edges found belong to other contours. Sharing ambiguous edgels (4.4) corrects this in part;
     # excluding these contours corrects more.
     interior: bool = False
+    # precision about zero of the displacement of a segment's contours in one view, which the equations then contain as
+    # an unknown; in their unit, pixels of contour times square pixels a square metre. 0: contours are not displaced
+    displacement: float = 0.0
 
     def __post_init__(self) -> None:
         for name, value, valid, expected in (

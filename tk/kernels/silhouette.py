@@ -38,8 +38,10 @@ from tk.kernels.vectors import cross, norm2, pulled, times, transposed_times
 from tk.kernels.wrench import (
     INERTIA,
     INERTIA_NUMBERS,
-    PULL,
+    OF_VIEW,
     PULL_NUMBERS,
+    VIEW_NUMBERS,
+    add_displaced,
     collect_inertias,
     collect_pulls,
 )
@@ -47,8 +49,9 @@ from tk.kernels.wrench import (
 # Columns of an exported sample: see Edgels.
 _EXPORT = 13
 # Columns of the packed settings. SCALE: pixels of the full picture in one of this scale; the others: SearchSettings.
-_NUMBERS = tuple(range(12))
-SCALE, WINDOW, SPACING, AMBIGUOUS, TANGENTIAL, ROBUST, LOST, COLORS, MOST_SAMPLES, INTERIOR, EXPORT, RATIO = _NUMBERS
+_NUMBERS = tuple(range(13))
+SCALE, WINDOW, SPACING, AMBIGUOUS, TANGENTIAL, ROBUST, LOST, DISPLACED = _NUMBERS[:8]
+COLORS, MOST_SAMPLES, INTERIOR, EXPORT, RATIO = _NUMBERS[8:]
 # Columns of ``sums``: cost, weight of the samples that found an edge, weight of all, steps made; then the gradient.
 COST, FOUND, ALL, STEPS, GRADIENT = range(5)
 
@@ -166,7 +169,7 @@ def prepare_pose(
     for i in range(GRADIENT):
         sums[b, i] = 0.0
     for k in range(tree.shape[0]):
-        for i in range(INERTIA_NUMBERS + PULL_NUMBERS):
+        for i in range(2 * VIEW_NUMBERS):
             joints[b, k, INERTIA + i] = 0.0
 
 
@@ -261,10 +264,14 @@ def search_contours(
         sums[b, FOUND] = sums[b, FOUND] + met
         sums[b, ALL] = sums[b, ALL] + all_samples
         k = ti.cast(parts[p, PART_MOVED], ti.i32)
+        into = OF_VIEW if numbers[DISPLACED] > 0.0 else INERTIA
         for a in ti.static(range(INERTIA_NUMBERS)):
-            joints[b, k, INERTIA + a] = joints[b, k, INERTIA + a] + inertia[a]
+            joints[b, k, into + a] = joints[b, k, into + a] + inertia[a]
         for a in ti.static(range(PULL_NUMBERS)):
-            joints[b, k, PULL + a] = joints[b, k, PULL + a] + pull[a]
+            joints[b, k, into + INERTIA_NUMBERS + a] = joints[b, k, into + INERTIA_NUMBERS + a] + pull[a]
+        if numbers[DISPLACED] > 0.0 and q == Q - 1:
+            for j in range(joints.shape[1]):
+                add_displaced(joints, b, j, numbers[DISPLACED])
 
 
 @functools.cache
@@ -282,7 +289,7 @@ def _descent_kernel(real):
         image: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (V, H, W, 3) of the full picture
         likelihood: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (G, COLOR_BINS)
         # settings
-        numbers: ti.types.ndarray(dtype=real, ndim=1),  # (12,) from SCALE to RATIO
+        numbers: ti.types.ndarray(dtype=real, ndim=1),  # (13,) from SCALE to RATIO
         free: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (n,) this and the next three: :class:`NewtonSteps`
         terms: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (2 + B, D)
         matrix: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (B, D, D) or (1, D, D)
@@ -292,7 +299,7 @@ def _descent_kernel(real):
         state: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (B, D) in and out
         # scratch: joints, inertias and pulls (:mod:`tk.kernels.wrench`), contours (:mod:`tk.kernels.cone_contours`)
         pose: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
-        joints: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 45)
+        joints: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 72)
         placed: ti.types.ndarray(dtype=real, ndim=3),  # (B, P, 16)
         hiders: ti.types.ndarray(dtype=ti.i64, ndim=3),  # (B, V, P)
         outlines: ti.types.ndarray(dtype=real, ndim=2),  # (B V Q, 31)
@@ -391,7 +398,7 @@ def _numbers(
     s: SearchSettings, scale: float, weight: float, step: int, export: bool, dtype: np.dtype
 ) -> NDArray[np.floating]:
     """Pack the settings in the order from SCALE to RATIO."""
-    pixels = scale, s.window_px, s.spacing_px, s.ambiguous_px, s.tangential, s.robust_px, s.lost_px
+    pixels = scale, s.window_px, s.spacing_px, s.ambiguous_px, s.tangential, s.robust_px, s.lost_px, s.displacement
     return np.array((*pixels, weight, s.most_samples, s.interior, export, 1 / step), dtype)
 
 
@@ -404,7 +411,7 @@ def _no_regions() -> Regions:
 def _scratch(B: int, V: int, Q: int, D: int, P: int, dtype: np.dtype) -> tuple[NDArray, ...]:
     return (
         np.empty((B, D), dtype),
-        np.empty((B, D, PULL + PULL_NUMBERS), dtype),
+        np.empty((B, D, OF_VIEW + VIEW_NUMBERS), dtype),
         np.empty((B, P, PLACED_NUMBERS), dtype),
         np.empty((B, V, P), np.int64),
         np.empty((B * V * Q, OUTLINE_NUMBERS), dtype),

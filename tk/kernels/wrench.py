@@ -22,7 +22,7 @@ of the inertia, row by row.
 
 from tk.kernels.kinematics import JOINT_NUMBERS, TWIST, parent_of
 from tk.kernels.runtime import ti
-from tk.kernels.vectors import cross, norm_sqr, triple_in
+from tk.kernels.vectors import cross, dot, norm_sqr, times, triple_in
 
 MOTION, WRENCH = JOINT_NUMBERS, JOINT_NUMBERS + 6
 INERTIA = JOINT_NUMBERS
@@ -30,6 +30,8 @@ INERTIA_NUMBERS = 21
 SCRATCH_NUMBERS = INERTIA + INERTIA_NUMBERS
 # After the inertia, in the scratch of a kernel that needs both: a wrench about the origin of the inertias.
 PULL, PULL_NUMBERS = SCRATCH_NUMBERS, 6
+# After both, the inertia and the wrench of what one view shows of the segment.
+OF_VIEW, VIEW_NUMBERS = PULL + PULL_NUMBERS, INERTIA_NUMBERS + PULL_NUMBERS
 
 
 @ti.func
@@ -104,6 +106,41 @@ def add_direction(scratch: ti.template(), c: int, k: int, moment, force, weight)
         for j in ti.static(range(i + 1)):
             a = INERTIA + i * (i + 1) // 2 + j
             scratch[c, k, a] = scratch[c, k, a] + weight * g[i] * g[j]
+
+
+@ti.func
+def add_displaced(scratch: ti.template(), c: int, k: int, precision):
+    """Add a view's inertia and wrench of row k to the row's own and clear them. In this view all points of the segment
+    are displaced together; the displacement has this precision about zero along each axis and is eliminated."""
+    view = ti.Vector([0.0 * precision for _ in range(3)])
+    own = ti.Matrix([[0.0 * precision for _ in range(3)] for _ in range(3)])
+    for i in ti.static(range(3)):
+        view[i] = scratch[c, k, OF_VIEW + INERTIA_NUMBERS + 3 + i]
+        for j in ti.static(range(3)):
+            own[i, j] = scratch[c, k, OF_VIEW + _lower(3 + i, 3 + j)] + (precision if i == j else 0.0 * precision)
+    inverse = own.inverse()
+    for i in range(6):
+        gain = times(inverse, _forces(scratch, c, k, i))
+        wrench = OF_VIEW + INERTIA_NUMBERS + i
+        scratch[c, k, PULL + i] = scratch[c, k, PULL + i] + scratch[c, k, wrench] - dot(gain, view)
+        for j in range(i + 1):
+            a, rest = i * (i + 1) // 2 + j, dot(gain, _forces(scratch, c, k, j))
+            scratch[c, k, INERTIA + a] = scratch[c, k, INERTIA + a] + scratch[c, k, OF_VIEW + a] - rest
+    for a in range(VIEW_NUMBERS):
+        scratch[c, k, OF_VIEW + a] = 0.0
+
+
+@ti.func
+def _lower(i, j):
+    """Return the place of element (i, j) in the lower triangle of an inertia."""
+    low, high = ti.min(i, j), ti.max(i, j)
+    return high * (high + 1) // 2 + low
+
+
+@ti.func
+def _forces(scratch: ti.template(), c: int, k: int, i: int):
+    """Return the elements (i, 3) to (i, 5) of a view's inertia in row k."""
+    return ti.Vector([scratch[c, k, OF_VIEW + _lower(i, 3 + j)] for j in ti.static(range(3))])
 
 
 @ti.func

@@ -220,5 +220,5 @@ COLUMNS = {
     "pose": "pose", "joints/position": "joints", "joints/sigma": "sigma", "residual": "residual", "status": "status",
     "objective": "objective", "landmarks": "landmarks", "landmark_depth": "landmark_depth", "evidence/reason": "reason",
     "evidence/camera": "camera_state", "evidence/found": "found", "evidence/origin": "origin",
-    "evidence/sigma": "deviation",
+    "evidence/sigma": "deviation", "evidence/modes": "modes",
 }  # fmt: skip

@@ -63,10 +63,15 @@ class Draft:
         evidence = ("reason", "found", "origin", "sigma", "camera")
         datasets = ("pose", "residual", "objective", *(f"evidence/{name}" for name in evidence))
         columns = {dataset: self.current(dataset).copy() for dataset in datasets}
+        if (modes := self.current("evidence/modes")) is not None:
+            columns["evidence/modes"] = modes = modes.copy()
+            modes[rows] = np.nan
         for row, e in zip(rows, estimates, strict=True):
             columns["pose"][row], columns["objective"][row] = e.pose, e.objective
             columns["evidence/sigma"][row], columns["residual"][row] = e.deviation, e.residual
             columns["evidence/reason"][row], columns["evidence/found"][row] = e.reason, e.found
+            if e.modes is not None and modes is not None:
+                modes[row] = e.modes
             if e.cameras is not None:  # else those of the first pass were left out
                 columns["evidence/camera"][row] = e.cameras
             if columns["evidence/origin"][row] != Status.INITIALISED:

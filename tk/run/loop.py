@@ -304,6 +304,7 @@ def _row(estimate: Estimate, store_hull: bool) -> Row:
         "evidence/found": estimate.found,
         "evidence/origin": estimate.origin,
         "evidence/sigma": estimate.deviation,
+        "evidence/modes": estimate.modes,
         "evidence/camera": estimate.cameras if estimate.residual is not None else None,
         "evidence/shift": estimate.shift if estimate.residual is not None else None,
         "status": int(Status[estimate.status.upper()]),

@@ -42,11 +42,6 @@ HEADING_FRAMES = 12
 
 #: entry in `/model` of a result after the second pass
 REFINED = "refined"
-# A joint keeps its sigma of the first pass where that exceeds the sigma of the second pass by this factor. With 1, 5 %
-# more of walk's joints are within one sigma, where 12 % too many are; 4 changes such shares by less than 1 %. Without
-# the rule, joints more than 15 cm off with a sigma below 5 cm rise from 0 to 0.1 % (dance, three cameras) and from 1.0
-# to 1.1 % (walk, two).
-_LESS_SURE = 2.0
 
 
 @dataclass(frozen=True)
@@ -186,10 +181,12 @@ class _Finisher:
                 draft.current("residual"),
                 subject.height_m,
                 self._landmarks(draft, self.late),
+                draft.current("evidence/modes"),
                 keep_body=subject.body is not None,
                 report=self.within,
             )
-            sigma = sigma_of_both(draft.current("evidence/sigma"), precise)
+            # a joint that the first pass knew nothing about stays unknown
+            sigma = np.where(np.isnan(draft.current("evidence/sigma")), np.nan, precise)
             draft.columns |= {"pose": poses, "residual": residual, "evidence/sigma": sigma}
             draft.refined = True
 
@@ -220,7 +217,14 @@ class _Finisher:
             """Return the cost of poses (F, D) after a second pass, of the frames that neither draft has lost."""
             residual, both = one.current("residual"), np.flatnonzero(~(draft.lost | one.lost))
             again = tracker.second_pass(
-                masks.sequence(draft.result.frames), poses, one.lost, residual, height_m, landmarks, True, self.within
+                masks.sequence(draft.result.frames),
+                poses,
+                one.lost,
+                residual,
+                height_m,
+                landmarks,
+                keep_body=True,
+                report=self.within,
             )
             shown, marked = seen(both)
             return tracker.trajectory_cost(shown, again[0][both], marked)
@@ -365,12 +369,6 @@ class _Finisher:
         draft.columns |= {"evidence/reason": reasons, "status": status_of(origin, reasons)}
         if (sigma := draft.current("evidence/sigma")) is not None:
             draft.columns["joints/sigma"] = known_sigma(sigma, reasons)
-
-
-def sigma_of_both(first: Float, second: Float) -> Float:
-    """Return sigma (F, J), metres, of the second pass, or of the first one where that is much larger or NaN: it tracked
-    several poses, or did not find a limb."""
-    return np.where(first <= _LESS_SURE * second, second, first)
 
 
 def _report(frames: NDArray[np.int64], reasons: NDArray[np.uint8] | None, note: Note, person: int, alone: bool) -> None:

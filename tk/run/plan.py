@@ -163,6 +163,7 @@ class Plan:
             reasons=MEANINGS,
             judged=True,
             deviation=tracker.reports_sigma,
+            modes=tracker.has_second_pass,
             camera_states=STATE_MEANINGS if tracker.reports_sigma else (),
             segment_names=SEGMENTS if tracker.has_segments else (),
             feet=tracker.has_segments,

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError
 from tk.kernels.mask_values import OTHERS, PERSON
-from tk.model.body.joint_sigma import VIEW_M
+from tk.model.body.joint_sigma import CHANGING_M
 from tk.model.body.plausibility import check_extent, check_stature
 from tk.model.cameras.common_view import determine_depth
 from tk.model.cameras.landmark_agreement import evidence_for_cameras
@@ -141,7 +141,7 @@ class CameraMonitor(Stateful[MonitorState]):
         if agreement.refusal:
             raise CaptureError(agreement.refusal)
         if self._region is not None:
-            self._region.view_m = float(np.hypot(VIEW_M, agreement.undetected_m))
+            self._region.view_m = float(np.hypot(CHANGING_M, agreement.undetected_m))
         for camera in agreement.wrong:
             self._cameras.be(camera, WRONG)
             self._opening_reasons[camera] = agreement.reason(camera)

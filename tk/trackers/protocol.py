@@ -72,6 +72,8 @@ class Estimate:
         surface: the hull's surface, if the tracker made one.
         deviation: (J,) m, standard deviation of each joint position along one axis, as computed: also where the reason
             says that it is not known. None if the tracker does not report it.
+        modes: (2, D) other poses of the limbs that the frame leaves open, see
+            :func:`tk.trackers.proposals.limbs.others`; None if no limb was searched for.
         residual: (C, 2) missing area (body outside the mask) and surplus area (mask outside the body) by camera, shares
             of the person's pixels, NaN for a camera that was not used; their sum is E_S. None if not measured.
         masks: (C, H, W) uint8, what the tracker took for the person, cleaned; None where that is the observation's, and
@@ -97,6 +99,7 @@ class Estimate:
     timing: Mapping[str, float]
     surface: HullSurface | None = None
     deviation: Float | None = None
+    modes: Float | None = None
     residual: Float | None = None
     masks: NDArray[np.uint8] | None = None
     drawn: NDArray[np.bool_] | None = None
@@ -293,6 +296,7 @@ class TwoPassTracker(Tracker, Protocol):
         residual: Float,
         height_m: float | None,
         landmarks: Float | None = None,
+        modes: Float | None = None,
         keep_body: bool = False,
         report: Callable[[float], None] = lambda _: None,
     ) -> tuple[Float, Float, Float]:
@@ -305,6 +309,7 @@ class TwoPassTracker(Tracker, Protocol):
             residual: (F, C, 2) of the first pass; NaN where a camera was excluded.
             height_m: the subject's height, if known.
             landmarks: (F, C, L, 4) of the first pass, NaN where there are none.
+            modes: (F, 2, D) other poses of the limbs that the first pass left open, as in :class:`Estimate`.
             keep_body: leave the body as it is.
             report: receives the share of the work that is done.
 

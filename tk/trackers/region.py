@@ -30,13 +30,12 @@ from tk.io.results.status import Status
 from tk.kernels.mask_values import PERSON
 from tk.kernels.silhouette import normal_equations
 from tk.model.body.body_fit import STATURE_DEVIATION
-from tk.model.body.joint_sigma import VIEW_M, contour_variance, directions, posture_variance, view_variance
+from tk.model.body.joint_sigma import CHANGING_M, directions, pose_variance, posture_variance
 from tk.model.body.limb_candidates import Limb, turned
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import LearnedColors, color_bins
 from tk.model.cues.ray_costs import Evidence
-from tk.model.cues.visible_contours import contour_shares
 from tk.model.masks.mosaic import doubled
 from tk.model.masks.regions import SQUARE3
 from tk.model.masks.silhouettes import Pyramid
@@ -103,7 +102,6 @@ class _Look(NamedTuple):
     """How the best pose explains a frame."""
 
     label: NDArray[np.uint8]  # (V, h, w) the parts that the grid's rays meet
-    curvature: Float  # (D, D) JᵀWJ
     residual: Float  # (V, 2) missing and surplus area
 
     @property
@@ -144,7 +142,8 @@ class RegionTracker(ContourTracker[RegionState]):
     """Tracks one person. :meth:`start` once, then :meth:`step` for every frame, the first included.
 
     Attributes:
-        view_m: displacement of a bone's contours in one view, metres; larger if the calibration is doubtful.
+        view_m: displacement of a segment's contours in one view, metres along an axis; larger if the calibration is
+            doubtful.
     """
 
     State = RegionState
@@ -176,7 +175,7 @@ class RegionTracker(ContourTracker[RegionState]):
         self._postures = 0
         self._spread: Float = np.zeros(len(JOINTS))
         self._fresh = True
-        self.view_m = VIEW_M
+        self.view_m = CHANGING_M
         self._reset()
 
     def _reset(self) -> None:
@@ -250,9 +249,7 @@ class RegionTracker(ContourTracker[RegionState]):
         self._alive += [replace(h, previous=h.pose, jumped=False) for h in self._alive if h.jumped]
         starts = np.array([h.pose + contours.prediction * (h.pose - h.previous) for h in self._alive])
         levels, solver = self._iterations()
-        poses, hessian, iterations = self.settle(
-            pyramid, starts, levels, seen.images, self.prior(starts), solver=solver
-        )
+        poses, _, iterations = self.settle(pyramid, starts, levels, seen.images, self.prior(starts), solver=solver)
         watch.lap("optimise")
         mismatch, met = evidence.cast(self.body, poses)
         if not np.isfinite(mismatch).all():
@@ -264,7 +261,7 @@ class RegionTracker(ContourTracker[RegionState]):
         ]
         self._rank()
         i = int(np.argmin([np.abs(pose - self._best.pose).max() for pose in poses]))
-        look = _Look(met.label[i], hessian[i], evidence.residual(met.label[i]))
+        look = _Look(met.label[i], evidence.residual(met.label[i]))
         watch.lap("check")
         # propose, settle, choose: the person anywhere, then the limbs
         cut = not self._lost_for and self.residuals.jumped(look.residual)
@@ -280,8 +277,10 @@ class RegionTracker(ContourTracker[RegionState]):
             proposed.append(of_heading.propose(self, seen, best))
         if self._choose(seen, *proposed):
             look = self._look(seen)
+        modes = None
         if searched:
             self._spread = limbs.spread(self.body.skeleton, self._best.pose, best, found)
+            modes = limbs.others(self._best.pose, best, found)
         watch.lap("search")
         pose, error = self._best.pose, float(np.nanmean(look.error))
         reason = Match(
@@ -304,7 +303,7 @@ class RegionTracker(ContourTracker[RegionState]):
             self._refused += 1
         self._lost_for = self._lost_for + 1 if is_lost(reason) else 0
         self._fresh = False
-        deviation = self._sigma(pose, look, pyramid)
+        deviation = self._sigma(pose, look, seen)
         watch.lap("check")
         return Estimate(
             **self.pose_fields(pose),
@@ -314,6 +313,7 @@ class RegionTracker(ContourTracker[RegionState]):
             iterations=np.array([iterations.sum(), int(searched)], np.int32),
             timing=watch.laps,
             deviation=deviation,
+            modes=modes,
             residual=look.residual,
             masks=pyramid.masks[0],
             drawn=look.label > 0,
@@ -458,33 +458,49 @@ class RegionTracker(ContourTracker[RegionState]):
 
     def _look(self, seen: Seen) -> _Look:
         """Return how the best pose explains the frame."""
-        best = self._best.pose[None]
-        _, met = seen.evidence.cast(self.body, best)
-        regions = None if seen.images is None else self.colors.regions(seen.images, self.views.rig.frame_shape)
-        here = normal_equations(self.body.arrays, self.views.at(seen.pyramid, 0), best, self.line_search, regions)
-        return _Look(met.label[0], here.hessian[0], seen.evidence.residual(met.label[0]))
+        _, met = seen.evidence.cast(self.body, self._best.pose[None])
+        return _Look(met.label[0], seen.evidence.residual(met.label[0]))
 
-    def _sigma(self, pose: Float, look: _Look, pyramid: Pyramid) -> Float:
+    def _sigma(self, pose: Float, look: _Look, seen: Seen) -> Float:
         """Return (J,) one standard deviation of each joint's position along an axis, metres: from the evidence of this
         frame, the difference to the mean posture until now, what its cues contradict, the modes of the limbs, and
         the spread of the hypotheses."""
         skeleton = self.body.skeleton
-        covariance = np.linalg.inv(INFORMATION * (look.curvature + self.prior(pose).matrix[0]))
-        variance = self.variance(pose, covariance, look.label, look.residual)
+        prior = self.prior(pose[None])
+        hessian, _ = self.equations(seen.pyramid, pose[None], prior, self.view_m, seen.images)
+        variance = self.variance(pose, np.linalg.inv(hessian[0]), look.residual)
         self._postures = min(self._postures + 1, _POSTURE_FRAMES)
         self._mean_posture += (directions(skeleton, pose) - self._mean_posture) / self._postures
         variance += posture_variance(skeleton, pose, self._mean_posture) + self._spread
-        variance += self.contradiction(pyramid, pose[None])[0]
+        variance += self.contradiction(seen.pyramid, pose[None])[0]
         if len(self._alive) > 1:
             poses, cost = (np.array(column) for column in zip(*((h.pose, h.cost) for h in self._alive), strict=True))
             variance += disagreement(skeleton, poses, cost)
         return np.asarray(np.sqrt(variance))
 
-    def equations(self, pyramid: Pyramid, poses: Float, prior: Quadratic) -> tuple[Float, Float]:
+    def equations(
+        self,
+        pyramid: Pyramid,
+        poses: Float,
+        prior: Quadratic,
+        view_m: float = 0.0,
+        images: NDArray[np.uint8] | None = None,
+    ) -> tuple[Float, Float]:
         """Return the normal equations (B, D, D), (B, D) of B frames at poses (B, D), nats: contours at the finest
-        scale, cues, prior and limits."""
-        skeleton = self.body.skeleton
-        here = normal_equations(self.body.arrays, self.views.at(pyramid, 0), poses, self.line_search)
+        scale, cues, prior and limits.
+
+        Args:
+            pyramid, images: as for :meth:`settle`; images of a single frame.
+            poses: (B, D).
+            prior: of the poses.
+            view_m: standard deviation, metres along an axis, of the displacement of a segment's contours in one view,
+                an unknown that is eliminated; 0: contours are not displaced.
+        """
+        skeleton, search = self.body.skeleton, self.line_search
+        if view_m:
+            search = replace(search, displacement=1.0 / (view_m**2 * INFORMATION))
+        regions = None if images is None else self.colors.regions(images, self.views.rig.frame_shape)
+        here = normal_equations(self.body.arrays, self.views.at(pyramid, 0), poses, search, regions)
         terms = self.terms(pyramid, prior)
         assert terms is not None
         linear, matrix = terms(poses)
@@ -497,25 +513,16 @@ class RegionTracker(ContourTracker[RegionState]):
         gradient = here.gradient + linear - (matrix @ poses[..., None])[..., 0] + pull * excess
         return INFORMATION * hessian, INFORMATION * gradient
 
-    def variance(self, pose: Float, covariance: Float, label: NDArray[np.uint8], residual: Float) -> Float:
-        """Return (..., J) variance of the joints' positions along an axis, metres², from the contours' noise and the
-        directions of the views, scaled by the residual.
+    def variance(self, pose: Float, covariance: Float, residual: Float) -> Float:
+        """Return (..., J) variance of the joints' positions along an axis, metres², scaled by the residual.
 
         Args:
             pose: (..., D).
-            covariance: (..., D, D) of the pose, by the contours' noise.
-            label: (..., V, h, w) the parts that the grid's rays meet.
+            covariance: (..., D, D) of the pose.
             residual: (..., V, 2); NaN for a view that was not used.
         """
-        body = self.body
-        joints = body.skeleton.joints(pose)
-        noise = contour_variance(body.skeleton, pose, covariance)
-        rays = joints[..., None, :, :] - self.world.rig.centers[:, None]
-        rays /= np.sqrt((rays**2).sum(axis=-1, keepdims=True))
-        shares = contour_shares(body, self.screen, label, joints)
-        used = np.isfinite(residual[..., 0])
-        views = view_variance(rays, np.where(used[..., None], shares, 0.0), self.view_m)
-        return np.asarray((noise + views) * variance_factor(residual)[..., None])
+        noise = pose_variance(self.body.skeleton, pose, covariance)
+        return np.asarray(noise * variance_factor(residual)[..., None])
 
     def second_pass(
         self,
@@ -525,13 +532,14 @@ class RegionTracker(ContourTracker[RegionState]):
         residual: Float,
         height_m: float | None,
         landmarks: Float | None = None,
+        modes: Float | None = None,
         keep_body: bool = False,
         report: Callable[[float], None] = lambda _: None,
     ) -> tuple[Float, Float, Float]:
         """See :class:`~tk.trackers.protocol.TwoPassTracker` and :mod:`tk.trackers.second_pass`."""
         if lost.all():
             return poses, residual, np.zeros((len(poses), len(JOINTS)))
-        again = SecondPass(self, masks, landmarks, self.world.poses_in(poses), lost, residual, report)
+        again = SecondPass(self, masks, landmarks, modes, self.world.poses_in(poses), lost, residual, report)
         if self.contours.adapt and not keep_body:
             again.fit_body(height_m)
         again.settle()

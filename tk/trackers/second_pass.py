@@ -10,7 +10,9 @@ The first pass may have misplaced an arm, exchanged the legs, or taken the back 
 poses of the body and of its arms are tracked through the whole recording, forwards and backwards. They begin at the
 pose in the neighbouring frame, or at the exchanged legs. A hidden Markov model with two states, the present and the
 other pose, gives the probability of either in each frame, from the costs in all frames and the lengths of the joints'
-steps (Rabiner, Proc. IEEE, 1989). The pose becomes the likelier one, and σ includes the difference.
+steps (Rabiner, Proc. IEEE, 1989). The pose becomes the likelier one, and σ includes the difference. Other poses that
+the first pass found in its limb searches are tracked in the same manner, from the frames of the searches on, and only
+add to σ: the first pass has compared them with colours.
 
 Then one problem of all frames, coupled by the motion, gives the poses and their covariances
 (:mod:`tk.optim.trajectory`).
@@ -29,7 +31,7 @@ from numpy.typing import NDArray
 
 from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.body.body_fit import STATURE_DEVIATION
-from tk.model.body.joint_sigma import directions, posture_variance
+from tk.model.body.joint_sigma import CONSTANT_M, directions, posture_variance
 from tk.model.body.limb_candidates import Limb, exchanged
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.bundle import LONGEST_STEP
@@ -56,11 +58,13 @@ AT_ONCE = 16
 ROUNDS, WINDOW, OVERLAP = 2, 1000, 30
 # Scale at which other poses are optimised.
 LEVEL = 1
-# Seconds within which frames err alike: the likelihood of a frame counts by its share of this time. At 15 Hz and with
-# four views a cost of 0.01 is then one nat, as chosen before. The negative
-# logarithm of a step's probability is its length divided by STEP_M. In frames with pixels of other people another pose
-# costs SHARED nats more, because the masks do not show the colours by which the first pass has chosen.
-CORRELATED_S, STEP_M, SHARED = 0.17, SAME_POSE_M, 1.0
+# Clothes, shadows and the shapes of the model err alike as long as the pose is the same. So the likelihood of a frame
+# counts by the share of CORRELATED_M, metres, that the fastest joint moves in it, and at least by its share of STILL_S,
+# seconds: a person who stands still is seen once, not once a frame.
+CORRELATED_M, STILL_S = 0.33, 1.0
+# The negative logarithm of a step's probability is its length divided by STEP_M. In frames with pixels of other people
+# another pose costs SHARED nats more, because the masks do not show the colours by which the first pass has chosen.
+STEP_M, SHARED = SAME_POSE_M, 1.0
 
 
 @dataclass(frozen=True)
@@ -70,12 +74,15 @@ class Alternative:
     Attributes:
         dofs: the degrees of freedom in which it differs.
         limb: if they are a limb's, only this limb moves.
-        legs: the legs, if it begins with exchanged legs; otherwise it begins at the pose in the neighbouring frame.
+        legs: the legs, if it begins with exchanged legs.
+        mode: its row, if it begins at the modes of the first pass; it never becomes the pose. Without legs or mode it
+            begins at the pose in the neighbouring frame.
     """
 
     dofs: NDArray[np.int64]
     limb: Limb | None = None
     legs: tuple[Limb, ...] = ()
+    mode: int | None = None
 
 
 class SecondPass:
@@ -85,6 +92,7 @@ class SecondPass:
         tracker: with the body and the cameras of this pass.
         masks: (C, H, W) of each frame, cleaned.
         landmarks: (F, C, L, 4) of each frame, NaN where there are none; None if no frame has any.
+        modes: (F, 2, D) other poses of the limbs that each frame leaves open; None if they are unknown.
         poses: (F, D) of the first pass.
         lost: (F,) bool; such frames are not used and do not change.
         residual: (F, C, 2) of the first pass; a camera whose residual is NaN in a frame is not used in it.
@@ -100,18 +108,23 @@ class SecondPass:
         tracker: RegionTracker,
         masks: Sequence[NDArray[np.uint8]],
         landmarks: Float | None,
+        modes: Float | None,
         poses: Float,
         lost: NDArray[np.bool_],
         residual: Float,
         report: Callable[[float], None],
     ) -> None:
         self.tracker, self._masks, self._report = tracker, masks, report
-        self._landmarks = landmarks
-        self._share = min(1.0, 1.0 / (tracker.fps * CORRELATED_S))
+        self._landmarks, self._modes = landmarks, modes
         self.tracked = np.flatnonzero(~lost)
+        self._share = np.ones(len(poses))
+        steps, seen = _steps(tracker.body.skeleton.joints(poses[self.tracked])), len(self.tracked)
+        self._share[self.tracked] = np.clip(steps / CORRELATED_M, 1.0 / min(tracker.fps * STILL_S, seen), 1.0)
         self.poses, self.residual = poses.copy(), np.array(residual)
         self._variance = np.zeros((2, len(poses), len(JOINTS)))  # of the pose, and of the choice between two
         self._body_variance: Float = np.zeros(len(JOINTS))
+        # few frames do not tell the constant part of the displacement from an error
+        self._view_m = float(np.hypot(tracker.view_m, CONSTANT_M if len(self.tracked) <= FIT_FRAMES else 0.0))
         self._done = 0
 
     @property
@@ -163,17 +176,22 @@ class SecondPass:
     def _smoothed(self, frames: NDArray[np.int64], near: Float, motion: MotionTerm) -> tuple[Float, Float]:
         """Return the poses (N, D) of frames, near poses (N, D), and their covariances (N, D, D)."""
         poses = near.copy()
-        for _ in range(ROUNDS):
-            equations = Equations(len(poses), poses.shape[1], 0)
+
+        def linearised(view_m: float) -> Equations:
+            equations, share = Equations(len(poses), poses.shape[1], 0), self._share[frames]
             for rows in _chunks(np.arange(len(frames))):
                 prior = self.tracker.prior(near[rows], ANGLE_DEG)
-                hessian, gradient = self.tracker.equations(self._together(frames[rows]), poses[rows], prior)
-                equations.hessian[rows], equations.gradient[rows] = self._share * hessian, self._share * gradient
+                hessian, gradient = self.tracker.equations(self._together(frames[rows]), poses[rows], prior, view_m)
+                equations.hessian[rows] = share[rows, None, None] * hessian
+                equations.gradient[rows] = share[rows, None] * gradient
             motion.add(equations, poses, frames)
-            reduced = equations.reduced()
-            poses += np.clip(reduced.plain, -LONGEST_STEP[0], LONGEST_STEP[0])
+            return equations
+
+        for _ in range(ROUNDS):
+            equations = linearised(0.0)
+            poses += np.clip(equations.reduced().plain, -LONGEST_STEP[0], LONGEST_STEP[0])
             self._advance(len(frames))
-        return poses, reduced.chain.covariance
+        return poses, linearised(self._view_m).reduced().chain.covariance
 
     def _judge(self, frames: NDArray[np.int64], covariance: Float) -> None:
         """Set the residuals and the variances of frames, whose poses have covariances (N, D, D)."""
@@ -181,7 +199,7 @@ class SecondPass:
         label = tracker.screen.render(tracker.body, poses).label
         sampled = tracker.screen.sample(seen.masks[0]).reshape(label.shape)
         self.residual[frames] = residual = residual_of(label > 0, sampled >= PERSON, sampled == OTHERS)
-        variance = tracker.variance(poses, covariance, label, residual)
+        variance = tracker.variance(poses, covariance, residual)
         self._variance[0, frames] = variance + tracker.contradiction(seen, poses)
 
     def decide(self) -> None:
@@ -192,6 +210,9 @@ class SecondPass:
         legs = tuple(limb for limb in self.tracker.limbs if limb.name.startswith("leg"))
         every = np.arange(self.poses.shape[1])
         alternatives = [Alternative(every), Alternative(rest, legs=legs), *arms]
+        if self._modes is not None:
+            rows = range(self._modes.shape[1])
+            alternatives += [Alternative(limb.dofs, limb, mode=k) for limb in self.tracker.limbs for k in rows]
         for step in (1, -1):
             for one, poses, cost in zip(alternatives, *self._track(alternatives, step), strict=True):
                 other = self.poses.copy()
@@ -202,7 +223,8 @@ class SecondPass:
                 share = second_of_two(cost[frames], steps / STEP_M)
                 apart = ((joints[1] - joints[0]) ** 2).sum(axis=-1) / 3
                 self._variance[1, frames] += (share * (1.0 - share))[:, None] * apart
-                self.poses[frames[share > 0.5]] = other[frames[share > 0.5]]
+                if one.mode is None:
+                    self.poses[frames[share > 0.5]] = other[frames[share > 0.5]]
 
     def _interpolate(self) -> None:
         """Set angles that only landmarks show between those of the frames in which two images or more have landmarks:
@@ -253,13 +275,18 @@ class SecondPass:
                 # a limb behind other people costs nothing, and only the first pass sees its colours
                 hidden = SHARED * (pyramid.masks[0] == OTHERS).any()
                 result[differ[kept], i] = poses[differ[kept]]
-                cost[differ[kept], i] = self._share * more[kept] + hidden
+                cost[differ[kept], i] = self._share[i] * more[kept] + hidden
         return result, cost
 
     def _starts(self, one: Alternative, lasts: NDArray[np.int64], frames: NDArray[np.int64], step: int) -> Float:
         """Return the poses (N, D) from which an alternative begins in N frames; the present one where it does not."""
         poses, every, follows = self.poses[frames], self.tracker.search_frames, frames == lasts + step
-        if not one.legs:
+        if one.mode is not None:
+            assert self._modes is not None
+            angles = self._modes[frames, one.mode][:, one.dofs]
+            known = np.flatnonzero(np.isfinite(angles).all(axis=1))
+            poses[np.ix_(known, one.dofs)] = angles[known]
+        elif not one.legs:
             poses[np.ix_(follows, one.dofs)] = self.poses[np.ix_(lasts[follows], one.dofs)]
         elif every:
             for n in np.flatnonzero(follows & (frames % every == 0)).tolist():
@@ -333,6 +360,13 @@ def second_of_two(cost: Float, steps: Float) -> Float:
         backward[k - 1] = -np.logaddexp(*(-steps[:, :, k - 1] - (frame + backward)[k]).T)
     first, second = (forward + backward).T
     return np.asarray(1.0 / (1.0 + np.exp(np.clip(second - first, -500.0, 500.0))))
+
+
+def _steps(joints: Float) -> Float:
+    """Return (F,) how far the fastest of the joints (F, J, 3) moves in a frame, mean of the steps before and after."""
+    steps = np.sqrt((np.diff(joints, axis=0) ** 2).sum(axis=-1)).max(axis=-1)
+    beside = np.concatenate([steps[:1], steps, steps[-1:]]) if len(steps) else np.zeros(2)
+    return np.asarray((beside[:-1] + beside[1:]) / 2.0)
 
 
 def _chunks(frames: NDArray[np.int64]) -> list[NDArray[np.int64]]:

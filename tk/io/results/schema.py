@@ -164,6 +164,12 @@ ROWS = (
         _NAMES, field="deviation", optional="deviation", valid=(0, MAX_DISTANCE_M),
     ),
     Dataset(
+        "evidence/modes", "F 2 D", "float32",
+        "other poses of the limbs that the frame leaves open, the cheapest and the next: angles in the columns of each "
+        "limb; NaN without one",
+        {"names": "pose_names"}, field="modes", optional="modes",
+    ),
+    Dataset(
         "evidence/camera", "F C", "uint8", "the cameras that were left out of the frame, and why; 0: used",
         {"cameras": "residual_cameras", "meaning": "camera_states"}, field="camera_state", optional="camera_states",
     ),

@@ -33,6 +33,8 @@ OUTSIDE = 0.4
 PROMISING = 2.5
 # Poses that are proposed, at most.
 FINISHED = 2
+# Other poses of a limb that are kept for the second pass.
+KEPT = 2
 
 
 class Modes(NamedTuple):
@@ -100,6 +102,24 @@ def propose(finder: ContourFinder, seen: Seen, pose: Float, found: Sequence[Mode
             result.append(both)
     poses = np.array(result).reshape(-1, len(pose))
     return poses[np.argsort(seen.evidence.cost(finder.body, poses), kind="stable")[:FINISHED]] if result else poses
+
+
+def others(pose: Float, before: Float, found: Sequence[Modes]) -> Float:
+    """Return (KEPT, D) other poses of the limbs that a frame leaves open, as angles in the columns of each limb: in row
+    0 the cheapest, in row 1 the next one; NaN without one.
+
+    Args:
+        pose, before, found: as for :func:`spread`.
+    """
+    result = np.full((KEPT, len(pose)), np.nan)
+    for one in found:
+        limb, skeleton = one.limb, one.limb.skeleton
+        poses = np.repeat(pose[None], 1 + len(one.poses), axis=0)
+        poses[:, limb.dofs] = np.concatenate([before[None], one.poses])[:, limb.dofs]
+        differ = skeleton.apart(poses, skeleton.joints(pose)) > SAME_POSE_M
+        kept = limb.distinct(poses, np.where(differ, np.append(0.0, one.cost), np.inf), KEPT)
+        result[: len(kept), limb.dofs] = kept[:, limb.dofs]
+    return result
 
 
 def spread(skeleton: Skeleton, pose: Float, before: Float, found: Sequence[Modes]) -> Float:
