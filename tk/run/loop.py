@@ -21,7 +21,7 @@ from tk.io.results.reader import as_damage_error, read_result
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
 from tk.people.people import People, PeopleState
-from tk.people.person import Tracked
+from tk.people.person import Answer
 from tk.run.offline import REFINED
 from tk.run.plan import Plan
 from tk.run.prefetch import Observed
@@ -119,7 +119,7 @@ class Loop:
         _LOG.info("reading the first frames and learning what the scene looks like")
         plan.tracker.prepare()
         yield from self._step_through(self._started(observations, count))
-        if not self.people.members:
+        if not self.people.written:
             raise CaptureError(f"{plan.task.source.where}: nobody could be tracked: {self.people.refusal}")
 
     def _started(self, observations: Iterator[Observed], count: int) -> Iterator[Observed]:
@@ -196,7 +196,7 @@ class Loop:
                 if output:
                     rows = {e.person: _row(e, self.plan.task.options.store_hull) for e in estimates}
                     self._held.append((_run_row(estimates, {**laps, "total": total}), rows))
-                    if self.people.members:
+                    if self.people.written:
                         self._write(output, due)
                 finished.append(tuple(replace(e, timing={**laps, **e.timing, "total": total}) for e in estimates))
                 writing = time.perf_counter() - stepped
@@ -212,7 +212,7 @@ class Loop:
     def _write(self, output: Output, flush: bool) -> None:
         """Write the frames that are not in the file yet, and the bodies of people whose trackers have just started."""
         models = output.writer.models
-        for member in self.people.members:
+        for member in self.people.written:
             if member.number >= len(models) or not models[member.number]:
                 output.writer.write_model(member.tracker.model(), person=member.number)
         *earlier, last = self._held
@@ -243,7 +243,7 @@ class Loop:
             found.append(whole)
         return tuple(found)
 
-    def _kept(self, answer: Tracked) -> NDArray[np.uint8]:
+    def _kept(self, answer: Answer) -> NDArray[np.uint8]:
         """Return the cleaned masks (C, H, W) of a frame, also of cameras that disagree: they may be refined."""
         tracker = two_pass(self.plan.tracker)
         assert tracker is not None

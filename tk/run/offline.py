@@ -79,7 +79,7 @@ def finish(
         note: receives lines for the user.
         within: receives the share of a long stage that is done.
     """
-    members, contacts = people.members, people.contacts
+    members, contacts = people.written, people.contacts
     kept = [held(person) for person in found]
     results = exchanged(kept, contacts)
     for line in report(contacts):
