@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.captures.mask_store import MaskStore, MaskStores
+from tk.io.captures.mask_store import MaskStores
 from tk.io.results.data import Result, UsedCameras
 from tk.io.results.revision import Revision
 from tk.io.results.status import Status
@@ -79,26 +79,26 @@ def finish(
         note: receives lines for the user.
         within: receives the share of a long stage that is done.
     """
-    members, contacts = people.written, people.contacts
-    kept = [held(person) for person in found]
+    written, contacts = people.written, people.contacts
+    kept = [held(result) for result in found]
     results = exchanged(kept, contacts)
     for line in report(contacts):
         note(line)
     drafts = []
-    for member in members:
-        result = results[member.number]
-        draft = Draft(member, result, member.tracker, ~result.has_pose, result.has_pose & doubtful(result, contacts))
-        if result is not kept[member.number]:
+    for person in written:
+        result = results[person.number]
+        draft = Draft(person, result, person.tracker, ~result.has_pose, result.has_pose & doubtful(result, contacts))
+        if result is not kept[person.number]:
             columns = {dataset: getattr(result, name) for dataset, name in COLUMNS.items()}
             draft.columns = {dataset: values for dataset, values in columns.items() if values is not None}
         if masks is not None:
-            draft.masks = exchanged_masks(member.number, contacts, masks, result.frames)
+            draft.masks = exchanged_masks(person.number, contacts, masks, result.frames)
         drafts.append(draft)
-    revisions, finisher = {}, _Finisher(task, len(members) == 1, note, within, task.setup.rig)
+    revisions, finisher = {}, _Finisher(task, len(written) == 1, note, within, task.setup.rig)
     if people.has_segments:
         finisher.second_pass([draft for draft in drafts if finisher.has_masks(draft)])
     for draft in drafts:
-        number, reasons = draft.member.number, draft.current("evidence/reason")
+        number, reasons = draft.person.number, draft.current("evidence/reason")
         if people.has_segments:
             revisions[number] = without_absent(finisher.revision(draft), draft.result.status == Status.ABSENT)
             reasons = draft.current("evidence/reason")
@@ -154,7 +154,7 @@ class _Finisher:
         missing = [frame for frame in result.frames[~absent].tolist() if frame not in masks]
         if missing and not self.alone:
             self.note(
-                f"person {draft.member.number}: the second pass is omitted, because an earlier run kept no masks of "
+                f"person {draft.person.number}: the second pass is omitted, because an earlier run kept no masks of "
                 "each person"
             )
             return False
@@ -172,12 +172,11 @@ class _Finisher:
         if not drafts:
             return
         for draft in drafts if self.alone else ():
-            subject = draft.member.subject
-            if subject.init is None:  # a given pose shows where the front is
-                draft.tracker = self._with_true_heading(*draft.used, draft, subject.height_m)
+            if draft.person.subject.init is None:  # a given pose shows where the front is
+                draft.tracker = self._with_true_heading(draft)
         self._refine_cameras(drafts)
         for draft in drafts:
-            (tracker, masks), subject = draft.used, draft.member.subject
+            (tracker, masks), subject = draft.tracker_and_masks, draft.person.subject
             _LOG.info("second pass")
             poses, residual, precise = tracker.second_pass(
                 masks.sequence(draft.result.frames),
@@ -193,15 +192,14 @@ class _Finisher:
             draft.columns |= {"pose": poses, "residual": residual, "evidence/sigma": sigma}
             draft.refined = True
 
-    def _with_true_heading(
-        self, tracker: TwoPassTracker, masks: MaskStore, draft: Draft, height_m: float | None
-    ) -> TwoPassTracker:
+    def _with_true_heading(self, draft: Draft) -> TwoPassTracker:
         """If the opposite heading is not improbable, by all frames, track the person again with it and its body; keep
-        the more probable one. Return the tracker of the heading that is kept.
+        the more probable one in the draft. Return the tracker of the heading that is kept.
 
         A few views of a person who stands upright at the start hardly show where the front is; a whole recording does.
         Turned poses are worse than tracked ones. So they may refute the opposite heading, not confirm it.
         """
+        (tracker, masks), height_m = draft.tracker_and_masks, draft.person.subject.height_m
         rows = np.flatnonzero(~draft.lost)
         if not len(rows) or self.task.source.frame_count is None:
             return tracker
@@ -262,7 +260,7 @@ class _Finisher:
                     found.append(replace(judge.judge(frame.index, estimate), masks=None, drawn=None))
                     self.within(len(found) / len(rows))
         again = draft.copy()
-        again.replace(present, found)
+        again.take(present, found)
         return again
 
     def _refine_cameras(self, drafts: Sequence[Draft]) -> None:
@@ -272,7 +270,7 @@ class _Finisher:
         A camera that has been moved during the recording has no one place and is not compared.
         """
         _LOG.info("second pass: comparing the cameras")
-        tracker = drafts[0].used[0]
+        tracker = drafts[0].tracker_and_masks[0]
         world, people = tracker.world, [self._seen(draft) for draft in drafts]
         agreement = compare_cameras(people, tracker.views)
         if apart := "" if agreement is None else agreement.contradiction:
@@ -297,13 +295,13 @@ class _Finisher:
             draft.tracker, draft.masks = changed.tracker, changed.masks
             draft.lost, draft.columns = changed.lost, changed.columns
             for line in lines:
-                self.note(line if self.alone else f"person {draft.member.number}: {line}")
+                self.note(line if self.alone else f"person {draft.person.number}: {line}")
 
     def _seen(self, draft: Draft) -> TrackedPerson:
         """Return what the cameras are compared by."""
-        tracker, masks = draft.used
+        tracker, masks = draft.tracker_and_masks
         poses = tracker.world.poses_in(draft.current("pose"))
-        compared = masks.without(draft.member.monitor.moved)
+        compared = masks.without(draft.person.monitor.moved)
         return TrackedPerson(
             tracker.body, lru_cache(16)(compared.get), TrackedPoses(draft.result.frames, poses, ~draft.lost)
         )
@@ -325,10 +323,10 @@ class _Finisher:
         With several people, the pixels of each are known with the delays only. A source that cannot be read again is
         not tracked again.
         """
-        task, result, (tracker, masks) = self.task, draft.result, draft.used
+        task, result, (tracker, masks) = self.task, draft.result, draft.tracker_and_masks
         now = tracker.with_cameras(rig), retimed(masks, result.frames, late)
         again = replace(draft.copy(), tracker=now[0], masks=now[1])
-        first = Run.of(draft.used, result.frames, draft, np.flatnonzero(result.status != Status.ABSENT))
+        first = Run.of(draft.tracker_and_masks, result.frames, draft, np.flatnonzero(result.status != Status.ABSENT))
         out = first.left_out()
         source = task.source.shifted((np.array(task.source.time_offset_s) + late / task.setup.fps).tolist())
         if source is None or source.frame_count is None or not (self.alone if late.any() else out.any()):
@@ -337,12 +335,12 @@ class _Finisher:
         seen = self._landmarks(draft, late)
         landmarks = {} if seen is None else dict(zip(result.frames.tolist(), seen, strict=True))
         landmarks = {frame: own for frame, own in landmarks.items() if np.isfinite(own).any()}
-        done = track_again(first, now, source, task.setup, draft.member.subject, landmarks, self.within)
+        done = track_again(first, now, source, task.setup, draft.person.subject, landmarks, self.within)
         if done is None:
             return None
         found, monitor = done
         rows = np.flatnonzero(np.isin(result.frames, list(found)))
-        again.replace(rows, [found[int(frame)] for frame in result.frames[rows]])
+        again.take(rows, [found[int(frame)] for frame in result.frames[rows]])
         if not explains_better(Run.of(now, result.frames, again, rows), first):
             return None
         lines = ["tracking again: the images of the first pass were not synchronised"] if late.any() else []

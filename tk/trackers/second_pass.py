@@ -245,7 +245,7 @@ class SecondPass:
                 if not len(differ):
                     continue
                 pyramid = seen(i)
-                costs = self._costs(pyramid, np.concatenate([present[None], poses[differ]]))
+                costs = self.tracker.cost(pyramid, np.concatenate([present[None], poses[differ]]))
                 more = costs[1:] - costs[0]
                 mean[differ] = np.where(np.isnan(known[differ]), more, known[differ] + RENEWAL * (more - known[differ]))
                 mean[mean > DROPPED] = np.nan
@@ -312,10 +312,6 @@ class SecondPass:
             shown = shown.copy()
             shown[out] = 0
         return shown
-
-    def _costs(self, pyramid: Pyramid, poses: Float) -> Float:
-        """Return the costs (B,) of poses (B, D) by masks and landmarks, nats."""
-        return self.tracker.cost(pyramid, poses)
 
 
 def second_of_two(cost: Float, steps: Float) -> Float:
