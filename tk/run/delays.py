@@ -116,17 +116,17 @@ def retimed(store: MaskStore, frames: NDArray[np.int64], late: NDArray[np.int64]
     return result
 
 
-def retimed_landmarks(
-    landmarks: NDArray[np.float64] | None, frames: NDArray[np.int64], late: NDArray[np.int64]
-) -> NDArray[np.float64] | None:
-    """Return the landmarks (F, C, L, 4) of frames (F,) of cameras that are late by whole frames (C,); NaN if a camera
-    has no image."""
-    if landmarks is None or not late.any():
-        return landmarks
-    result = np.full(landmarks.shape, np.nan)
+def retimed_measured(
+    measured: NDArray[np.float64], frames: NDArray[np.int64], late: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return what was measured (F, C, N, K) in frames (F,) by cameras that are late by whole frames (C,); NaN if a
+    camera has no image."""
+    if not late.any():
+        return measured
+    result = np.full(measured.shape, np.nan)
     row = {frame: i for i, frame in enumerate(frames.tolist())}
     for c, n in enumerate(late.tolist()):
         for i, frame in enumerate(frames.tolist()):
             if frame - n in row:
-                result[i, c] = landmarks[row[frame - n], c]
+                result[i, c] = measured[row[frame - n], c]
     return result

@@ -17,11 +17,13 @@ from tk.io.results.status import Status
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.bundle import TrackedPoses
 from tk.model.cameras.camera import Rig
+from tk.model.cues import landmarks
+from tk.model.cues.cue import Measured, in_frames
 from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
 from tk.people.identity import COLUMNS, doubtful, exchanged, exchanged_masks, report
 from tk.people.people import People
-from tk.run.delays import TrackedPerson, retimed, retimed_landmarks
+from tk.run.delays import TrackedPerson, retimed, retimed_measured
 from tk.run.draft import Draft, held, without_absent
 from tk.run.prefetch import open_observations
 from tk.run.refinement import compare_cameras, refine_if_inconsistent
@@ -184,7 +186,7 @@ class _Finisher:
                 draft.lost,
                 draft.current("residual"),
                 subject.height_m,
-                self._landmarks(draft, self.late),
+                self._measured(draft, self.late),
                 keep_body=subject.body is not None,
                 report=self.within,
             )
@@ -205,39 +207,37 @@ class _Finisher:
             return tracker
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, HEADING_FRAMES).round().astype(int))]
         poses, unused = draft.current("pose"), np.isnan(draft.current("residual")[..., 0])
-        landmarks = self._landmarks(draft, self.late)
+        measured = self._measured(draft, self.late)
 
-        def seen(rows: NDArray[np.int64]) -> tuple[list[NDArray[np.uint8]], Float | None]:
-            """Return the masks and landmarks of frames by the cameras that were used."""
+        def seen(rows: NDArray[np.int64]) -> tuple[list[NDArray[np.uint8]], Measured]:
+            """Return the masks of frames, and what was measured in them, by the cameras that were used."""
             shown = [np.where(unused[row][:, None, None], 0, masks.get(int(draft.result.frames[row]))) for row in rows]
-            return shown, None if landmarks is None else np.where(
-                unused[rows][..., None, None], np.nan, landmarks[rows]
-            )
+            return shown, in_frames(measured, rows, ~unused[rows])
 
         def cost(tracker: TwoPassTracker, poses: Float, one: Draft) -> float:
             """Return the cost of poses (F, D) after a second pass, of the frames that neither draft has lost."""
             residual, both = one.current("residual"), np.flatnonzero(~(draft.lost | one.lost))
             again = tracker.second_pass(
-                masks.sequence(draft.result.frames), poses, one.lost, residual, height_m, landmarks, True, self.within
+                masks.sequence(draft.result.frames), poses, one.lost, residual, height_m, measured, True, self.within
             )
-            shown, marked = seen(both)
-            return tracker.trajectory_cost(shown, again[0][both], marked)
+            shown, known = seen(both)
+            return tracker.trajectory_cost(shown, again[0][both], known)
 
-        shown, marked = seen(rows)
-        headings = tracker.headings(shown, poses[rows], height_m, marked)
+        shown, known = seen(rows)
+        headings = tracker.headings(shown, poses[rows], height_m, known)
         if not headings:
             return tracker
         present, opposite = headings
         _LOG.info("comparing both headings: which way the person faces is unclear")
         turned = np.array([tracker.turned_pose(pose) for pose in poses])
-        known = cost(present, poses, draft)
-        if cost(opposite, turned, draft) > known + DROPPED:
+        least = cost(present, poses, draft)
+        if cost(opposite, turned, draft) > least + DROPPED:
             return tracker
         _LOG.info("tracking with the opposite heading")
         opposite.start_at(turned[np.flatnonzero(draft.result.status != Status.ABSENT)[0]])
         again, yaw = self._tracked_by(opposite, draft, unused), tracker.body.skeleton.index("torso_yaw")
         found, both = again.current("pose"), ~(draft.lost | again.lost)
-        if cost(opposite, found, again) >= known or np.median(np.cos(found[both, yaw] - poses[both, yaw])) > 0:
+        if cost(opposite, found, again) >= least or np.median(np.cos(found[both, yaw] - poses[both, yaw])) > 0:
             return tracker  # or it may have found the other heading by itself
         draft.lost, draft.columns = again.lost, again.columns
         self.note("the person faces the other way than the first frames seemed to show: tracked again")
@@ -306,14 +306,14 @@ class _Finisher:
             tracker.body, lru_cache(16)(compared.get), TrackedPoses(draft.result.frames, poses, ~draft.lost)
         )
 
-    def _landmarks(self, draft: Draft, late: NDArray[np.int64]) -> NDArray[np.float64] | None:
-        """Return the landmarks (F, C, L, 4) of a draft, in pixels of the cameras in use, synchronised with videos that
-        are late by whole frames (C,); None if it has none."""
+    def _measured(self, draft: Draft, late: NDArray[np.int64]) -> Measured:
+        """Return what the first pass has measured in the frames of a draft, in pixels of the cameras in use,
+        synchronised with videos that are late by whole frames (C,)."""
         found, depth = draft.current("landmarks"), draft.current("landmark_depth")
         if found is None or depth is None:
-            return None
-        found = np.concatenate([found, depth[..., None]], axis=-1)
-        return retimed_landmarks(self.task.setup.rig.reduced_pixels(found), draft.result.frames, late)
+            return {}
+        found = self.task.setup.rig.reduced_pixels(np.concatenate([found, depth[..., None]], axis=-1))
+        return {landmarks.NAME: retimed_measured(found, draft.result.frames, late)}
 
     def _with_cameras(self, draft: Draft, rig: Rig, late: NDArray[np.int64]) -> tuple[Draft, list[str]] | None:
         """Return a draft with other cameras, and without delays, (C,) frames, and lines for the user. The person is
@@ -332,10 +332,9 @@ class _Finisher:
         if source is None or source.frame_count is None or not (self.alone if late.any() else out.any()):
             return again, []
         _LOG.info("tracking again with the refined cameras")
-        seen = self._landmarks(draft, late)
-        landmarks = {} if seen is None else dict(zip(result.frames.tolist(), seen, strict=True))
-        landmarks = {frame: own for frame, own in landmarks.items() if np.isfinite(own).any()}
-        done = track_again(first, now, source, task.setup, draft.person.subject, landmarks, self.within)
+        seen = self._measured(draft, late).get(landmarks.NAME, ())
+        marked = {n: own for n, own in zip(result.frames.tolist(), seen, strict=False) if np.isfinite(own).any()}
+        done = track_again(first, now, source, task.setup, draft.person.subject, marked, self.within)
         if done is None:
             return None
         found, monitor = done

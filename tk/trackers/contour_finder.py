@@ -31,8 +31,8 @@ from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import spread_out
 from tk.model.cameras.landmark_agreement import consensus
 from tk.model.cameras.tracker_frame import TrackerFrame
+from tk.model.cues import landmarks
 from tk.model.cues.cue import Cue
-from tk.model.cues.landmarks import LandmarkCue, of_person, propose
 from tk.model.cues.part_colors import PartColors, RenderedBody
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Pyramid, Views
@@ -66,6 +66,8 @@ LINE_SEARCH = SearchSettings()
 # Half this tolerance, or none, leaves the mean joint error on eight captures unchanged to 0.02 cm; twice as much makes
 # fast arms worse by 0.1 cm.
 SOLVER = GaussNewtonSettings(scales=3, relaxation=1.6, tolerance=0.012)
+#: the cues by their names, in the order in which their terms are added
+CUES: Mapping[str, Callable[[Rig, ConeBody, Float], Cue]] = {landmarks.NAME: landmarks.LandmarkCue}
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ class Seen:
 
     Attributes:
         frame: the frame.
-        pyramid: its silhouettes, and the person's landmarks.
+        pyramid: its silhouettes, and what was measured of the person.
         evidence: its costs on the grid :attr:`ContourFinder.screen`.
         images: as in :meth:`ContourFinder.settle`.
     """
@@ -282,25 +284,26 @@ class ContourFinder:
     # --- one frame ----------------------------------------------------------------------------------------------
 
     def pyramid(self, frame: Frame) -> Pyramid:
-        """Return the frame's silhouettes, cleaned, at all scales, and the person's landmarks."""
+        """Return the frame's silhouettes, cleaned, at all scales, and what was measured of the person."""
         pyramid = self.views.pyramid(frame.masks, self.solver.scales, True)
-        return replace(pyramid, landmarks=of_person(frame.landmarks, pyramid.masks[0]))
+        marked = landmarks.of_person(frame.landmarks, pyramid.masks[0])
+        return pyramid if marked is None else replace(pyramid, measured={landmarks.NAME: marked})
 
-    def sighted(self, landmarks: Float) -> RenderedBody | None:
+    def sighted(self, seen: Float) -> RenderedBody | None:
         """Return the average body on the grid :attr:`choice`, at the pose that a person's landmarks (V, L, 4) show;
         None if no two images agree on them."""
-        points = consensus(self.views.rig, landmarks).points
+        points = consensus(self.views.rig, seen).points
         if not np.isfinite(points).any():
             return None
         body = build_cone_body(AVERAGE_BODY)
-        poses = propose(self.views.rig, body, landmarks, np.nanmean(points, axis=0))
+        poses = landmarks.propose(self.views.rig, body, seen, np.nanmean(points, axis=0))
         met = self.choice.render(body, poses[:1])
         return RenderedBody(met.label[0], met.depth[0])
 
     def cues(self, pyramid: Pyramid) -> list[Cue]:
-        """Return what a frame, or each of B frames, shows beside silhouettes: a further cue is listed here."""
-        marked = pyramid.landmarks
-        return [] if marked is None else [LandmarkCue(self.views.rig, self.body, marked)]
+        """Return what a frame, or each of B frames, shows beside silhouettes."""
+        rig, measured = self.views.rig, pyramid.measured
+        return [of(rig, self.body, measured[name]) for name, of in CUES.items() if name in measured]
 
     def contradiction(self, pyramid: Pyramid, poses: Float) -> Float:
         """Return (B, J) variance of the joints' positions, metres², by which the cues contradict poses (B, D)."""

@@ -33,6 +33,8 @@ from tk.model.body.joint_sigma import directions, posture_variance
 from tk.model.body.limb_candidates import Limb, exchanged
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.bundle import LONGEST_STEP
+from tk.model.cues import landmarks
+from tk.model.cues.cue import Measured, in_frames
 from tk.model.cues.ray_costs import residual_of
 from tk.model.masks.silhouettes import Pyramid
 from tk.model.motion.coupling import MotionTerm
@@ -84,7 +86,7 @@ class SecondPass:
     Args:
         tracker: with the body and the cameras of this pass.
         masks: (C, H, W) of each frame, cleaned.
-        landmarks: (F, C, L, 4) of each frame, NaN where there are none; None if no frame has any.
+        measured: of F frames, see :mod:`tk.model.cues.cue`.
         poses: (F, D) of the first pass.
         lost: (F,) bool; such frames are not used and do not change.
         residual: (F, C, 2) of the first pass; a camera whose residual is NaN in a frame is not used in it.
@@ -99,14 +101,14 @@ class SecondPass:
         self,
         tracker: RegionTracker,
         masks: Sequence[NDArray[np.uint8]],
-        landmarks: Float | None,
+        measured: Measured,
         poses: Float,
         lost: NDArray[np.bool_],
         residual: Float,
         report: Callable[[float], None],
     ) -> None:
         self.tracker, self._masks, self._report = tracker, masks, report
-        self._landmarks = landmarks
+        self._measured = measured
         self._share = min(1.0, 1.0 / (tracker.fps * CORRELATED_S))
         self.tracked = np.flatnonzero(~lost)
         self.poses, self.residual = poses.copy(), np.array(residual)
@@ -207,9 +209,9 @@ class SecondPass:
     def _interpolate(self) -> None:
         """Set angles that only landmarks show between those of the frames in which two images or more have landmarks:
         neither joints nor contours depend on them."""
-        if self._landmarks is None:
+        if (marked := self._measured.get(landmarks.NAME)) is None:
             return
-        images = np.isfinite(self._landmarks[self.tracked]).any(axis=(2, 3)).sum(axis=1)
+        images = np.isfinite(marked[self.tracked]).any(axis=(2, 3)).sum(axis=1)
         seen = self.tracked[images > 1]
         for k in np.flatnonzero(self.tracker.body.skeleton.is_by_landmarks) if len(seen) else ():
             self.poses[self.tracked, k] = np.interp(self.tracked, seen, self.poses[seen, k])
@@ -297,13 +299,9 @@ class SecondPass:
         return Pyramid.of_all([self._pyramid(i) for i in frames], 0)
 
     def _pyramid(self, i: int, scales: int = 1) -> Pyramid:
-        """Return the scales of the masks of frame i, and its landmarks, by the cameras that are used."""
-        landmarks = None
-        if self._landmarks is not None:
-            used = np.isfinite(self.residual[i, :, 0])
-            seen = np.where(used[:, None, None], self._landmarks[i], np.nan)
-            landmarks = seen if np.isfinite(seen).any() else None
-        return self.tracker.views.pyramid(self._seen(i), scales, False, landmarks)
+        """Return the scales of the masks of frame i, and what was measured in it, by the cameras that are used."""
+        measured = in_frames(self._measured, i, np.isfinite(self.residual[i, :, 0]))
+        return self.tracker.views.pyramid(self._seen(i), scales, False, measured)
 
     def _seen(self, i: int) -> NDArray[np.uint8]:
         """Return the masks (C, H, W) of frame i, empty where a camera is not used."""
