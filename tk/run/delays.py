@@ -123,10 +123,6 @@ def retimed_measured(
     camera has no image."""
     if not late.any():
         return measured
-    result = np.full(measured.shape, np.nan)
-    row = {frame: i for i, frame in enumerate(frames.tolist())}
-    for c, n in enumerate(late.tolist()):
-        for i, frame in enumerate(frames.tolist()):
-            if frame - n in row:
-                result[i, c] = measured[row[frame - n], c]
-    return result
+    shown = frames[:, None] - late
+    row = np.searchsorted(frames, shown).clip(max=len(frames) - 1)
+    return np.where((frames[row] == shown)[..., None, None], measured[row, np.arange(len(late))], np.nan)

@@ -300,16 +300,10 @@ class SecondPass:
 
     def _pyramid(self, i: int, scales: int = 1) -> Pyramid:
         """Return the scales of the masks of frame i, and what was measured in it, by the cameras that are used."""
-        measured = in_frames(self._measured, i, np.isfinite(self.residual[i, :, 0]))
-        return self.tracker.views.pyramid(self._seen(i), scales, False, measured)
-
-    def _seen(self, i: int) -> NDArray[np.uint8]:
-        """Return the masks (C, H, W) of frame i, empty where a camera is not used."""
-        shown, out = self._masks[int(i)], np.isnan(self.residual[i, :, 0])
-        if out.any():
-            shown = shown.copy()
-            shown[out] = 0
-        return shown
+        shown, used = self._masks[int(i)], np.isfinite(self.residual[i, :, 0])
+        if not used.all():
+            shown = np.where(used[:, None, None], shown, np.uint8(0))
+        return self.tracker.views.pyramid(shown, scales, False, in_frames(self._measured, i, used))
 
 
 def second_of_two(cost: Float, steps: Float) -> Float:
