@@ -99,8 +99,8 @@ class People:
         self._given: set[int] | None = None
         #: why nobody is tracked yet; empty before the first frame
         self.refusal = ""
-        share = sharing(first)
-        self._grid: RayGrid | None = None if share is None else share.choice
+        tracker = sharing(first)
+        self._grid: RayGrid | None = None if tracker is None else tracker.fine_grid
 
     def _person(self, number: int, subject: Subject, written: bool = True) -> Person:
         """Return somebody with the first tracker, whose kernels are compiled, or with another, if somebody has it."""
@@ -247,10 +247,10 @@ class People:
 
     def _sighted(self, frame: Frame) -> list[RenderedBody]:
         """Return the bodies that the landmarks in a frame show."""
-        share = sharing(self._first)
-        if share is None or frame.landmarks is None:
+        tracker = sharing(self._first)
+        if tracker is None or frame.landmarks is None:
             return []
-        return [body for landmarks in frame.landmarks if (body := share.sighted(landmarks)) is not None]
+        return [body for landmarks in frame.landmarks if (body := tracker.sighted(landmarks)) is not None]
 
     # --- one frame ----------------------------------------------------------------------------------------------------
 

@@ -132,12 +132,12 @@ class Person(Stateful[PersonMotion]):
         tracker = sharing(self.tracker)
         if tracker is None or self.lost or self.drawn is None or self.place is None:
             return False
-        shown = tracker.screen.sample(masks) >= PERSON
+        shown = tracker.coarse_grid.sample(masks) >= PERSON
         for camera, cells, body in zip(rig, shown, self.drawn, strict=True):
             area = np.count_nonzero(body)
             if np.count_nonzero(cells) <= (1 + STRANGER_SHARE) * area:
                 continue
-            reach = _ALONE_M * camera.pixels_per_metre(self.place) / tracker.screen.step
+            reach = _ALONE_M * camera.pixels_per_metre(self.place) / tracker.coarse_grid.step
             size = 2 * max(round(reach), 1) + 1
             near = cv2.dilate(body.view(np.uint8), np.ones((size, size), np.uint8)) > 0
             if np.count_nonzero(cells & ~near) > STRANGER_SHARE * area:
@@ -153,7 +153,7 @@ class Person(Stateful[PersonMotion]):
         body = self.drawn
         if body is None:
             return False
-        sampled = self.sharing.screen.sample(masks)
+        sampled = self.sharing.coarse_grid.sample(masks)
         covered = np.count_nonzero(body, axis=(1, 2))
         return bool((np.count_nonzero(body & (sampled < PERSON), axis=(1, 2)) >= 0.5 * covered).all())
 

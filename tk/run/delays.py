@@ -15,7 +15,7 @@ from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.bundle import TrackedPoses
 from tk.model.cameras.camera import Rig
 from tk.model.cues.ray_costs import RayGrid, residual_of
-from tk.trackers.contour_finder import SCREEN_ROWS
+from tk.trackers.contour_finder import COARSE_ROWS
 
 # Whole frames of a video's delay that are tried before the refinement, whose edges reach some pixels only; and the
 # frames in which they are tried. A delay at the edge of the range is no optimum: the range is then doubled, at most to
@@ -42,7 +42,7 @@ def whole_delays(people: Sequence[TrackedPerson], rig: Rig) -> NDArray[np.int64]
     The bodies explain the masks of a late video worse than those of the others, and those of some frames earlier well.
     The cameras are in the world of the poses.
     """
-    grid = RayGrid(rig, SCREEN_ROWS)
+    grid = RayGrid(rig, COARSE_ROWS)
     shares_of = [_shares_by_delay(person, grid, -(-DELAY_FRAMES // len(people))) for person in people]
     late, unknown, reach = np.zeros(len(rig), np.int64), np.ones(len(rig), np.bool_), REACH
     while unknown.any() and reach <= MOST:

@@ -21,7 +21,7 @@ from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.cues.ray_costs import RayGrid, residual_of
 from tk.model.setup import InitPose, Setup, Subject
 from tk.trackers.camera_monitor import CameraMonitor
-from tk.trackers.contour_finder import SCREEN_ROWS
+from tk.trackers.contour_finder import COARSE_ROWS
 from tk.trackers.protocol import Estimate, Frame, TwoPassTracker, shows_person
 
 Float = NDArray[np.float64]
@@ -85,7 +85,7 @@ class Run:
         """Return (N, C) E_S of some frames (N,) by all cameras, at most 1; 1 in lost frames, NaN where nobody is
         seen."""
         tracker = self.tracker
-        grid = RayGrid(tracker.world.rig, SCREEN_ROWS)
+        grid = RayGrid(tracker.world.rig, COARSE_ROWS)
         rows = np.searchsorted(self.frames, frames)
         poses = tracker.world.poses_in(self.poses[rows])
         found = np.empty((len(frames), len(grid.rig)))

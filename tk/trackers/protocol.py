@@ -206,16 +206,16 @@ class SharingTracker(Tracker, Protocol):
     """A tracker that does without the pixels of other people, see :class:`Frame`.
 
     Attributes:
-        choice: the grid on which its body is rendered.
-        screen: the coarse grid of :attr:`Estimate.drawn`.
+        fine_grid: the grid on which its body is rendered.
+        coarse_grid: that of :attr:`Estimate.drawn`.
     """
 
-    choice: RayGrid
-    screen: RayGrid
+    fine_grid: RayGrid
+    coarse_grid: RayGrid
 
     def sighted(self, landmarks: Float) -> RenderedBody | None:
-        """Return an average body on the grid :attr:`choice`, at the pose that a person's landmarks (C, L, 4) show; None
-        if no two images agree on them."""
+        """Return an average body on the grid :attr:`fine_grid`, at the pose that a person's landmarks (C, L, 4) show;
+        None if no two images agree on them."""
         ...
 
     def rendered(self, ahead: bool) -> RenderedBody:

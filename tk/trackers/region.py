@@ -329,7 +329,7 @@ class RegionTracker(ContourTracker[RegionState]):
         """
         if not (self.config.colors and self.colors.known and frame.images.size):
             return frame
-        foreign, grid = self.colors.foreign, self.screen
+        foreign, grid = self.colors.foreign, self.coarse_grid
         person = grid.sample(frame.masks) >= PERSON
         unknown = foreign[color_bins(grid.sample(frame.images)[person])]
         view = np.nonzero(person)[0]
@@ -514,7 +514,7 @@ class RegionTracker(ContourTracker[RegionState]):
         noise = contour_variance(body.skeleton, pose, covariance)
         rays = joints[..., None, :, :] - self.world.rig.centers[:, None]
         rays /= np.sqrt((rays**2).sum(axis=-1, keepdims=True))
-        shares = contour_shares(body, self.screen, label, joints)
+        shares = contour_shares(body, self.coarse_grid, label, joints)
         used = np.isfinite(residual[..., 0])
         views = view_variance(rays, np.where(used[..., None], shares, 0.0), self.view_m)
         return np.asarray((noise + views) * variance_factor(residual)[..., None])

@@ -180,8 +180,8 @@ class SecondPass:
     def _judge(self, frames: NDArray[np.int64], covariance: Float) -> None:
         """Set the residuals and the variances of frames, whose poses have covariances (N, D, D)."""
         tracker, seen, poses = self.tracker, self._together(frames), self.poses[frames]
-        label = tracker.screen.render(tracker.body, poses).label
-        sampled = tracker.screen.sample(seen.masks[0]).reshape(label.shape)
+        label = tracker.coarse_grid.render(tracker.body, poses).label
+        sampled = tracker.coarse_grid.sample(seen.masks[0]).reshape(label.shape)
         self.residual[frames] = residual = residual_of(label > 0, sampled >= PERSON, sampled == OTHERS)
         variance = tracker.variance(poses, covariance, label, residual)
         self._variance[0, frames] = variance + tracker.contradiction(seen, poses)
