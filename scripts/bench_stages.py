@@ -25,7 +25,7 @@ from tk.model.masks.silhouettes import Pyramid, Views
 from tk.optim import gauss_newton
 from tk.settings import Settings
 from tk.trackers.bodies import body_and_poses
-from tk.trackers.contour_finder import LINE_SEARCH, SCREEN_ROWS, SOLVER
+from tk.trackers.contour_finder import COARSE_ROWS, LINE_SEARCH, SOLVER
 from tk.trackers.proposals.limbs import NEARBY
 
 Float = np.ndarray
@@ -116,7 +116,7 @@ def silhouette_stages(
     last, pose = pyramids[-1], poses[-1][None]
     limb = limbs_of(body)[0]
     variants = limb.candidates(pose[0], NEARBY, np.random.default_rng(0))
-    evidence = Evidence.of(RayGrid(capture.rig, SCREEN_ROWS), last.masks[0])
+    evidence = Evidence.of(RayGrid(capture.rig, COARSE_ROWS), last.masks[0])
     drawn = np.setdiff1d(np.arange(len(body.parts), dtype=np.int32), limb.parts)
     _, rest = evidence.cast(body, pose, drawn)
     others = Cast(rest.label[0], rest.depth[0])

@@ -69,7 +69,7 @@ def choices(tracker: RegionTracker, frame: Frame, views: Sequence[int], truth: n
         seen = tracker.see(without_cameras(frame, out), None if out.any() else frame.images)
         starts = np.array([pose, *(one for _, one in wrong)])
         settled = tracker.settle(seen.pyramid, starts, (1, 0), seen.images).states
-        cost = tracker.evidence(tracker.choice, seen.frame, seen.pyramid).cost(tracker.body, settled)
+        cost = tracker.evidence(tracker.fine_grid, seen.frame, seen.pyramid).cost(tracker.body, settled)
         error = off(settled).mean(axis=1)
         apart = skeleton.apart(settled, skeleton.joints(settled[0]))
         for (kind, _), more, worse, far in zip(wrong, cost[1:] - cost[0], error[1:] > error[0], apart[1:], strict=True):

@@ -60,5 +60,5 @@ def test_somebody_who_cannot_be_tracked_does_not_end_the_run_of_others(tmp_path:
             people.start(opening)
         return
     assert people.start(opening)
-    assert [member.number for member in people.members] == [0]
+    assert [person.number for person in people.written] == [0]
     assert sum("cannot be tracked: no pose explains the masks" in line for line in told) == 1

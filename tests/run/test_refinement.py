@@ -34,7 +34,7 @@ from tk.model.cameras.bundle import TrackedPoses
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.refinement import turn_between
 from tk.run import offline as finish
-from tk.run.delays import TrackedPerson, retimed, retimed_landmarks, whole_delays
+from tk.run.delays import TrackedPerson, retimed, retimed_measured, whole_delays
 from tk.run.draft import Draft
 from tk.run.refined_calibration import refine_capture
 from tk.run.refinement import BetterCameras
@@ -254,13 +254,12 @@ def test_masks_of_late_cameras_come_from_other_frames() -> None:
 def test_landmarks_of_late_cameras_come_from_other_frames() -> None:
     frames = np.array([3, 4, 5, 7])  # frame 6 was not tracked
     landmarks = np.broadcast_to(frames[:, None, None, None], (4, 3, 2, 3)).astype(np.float64)
-    late = retimed_landmarks(landmarks, frames, np.array([0, 1, -2]))
+    late = retimed_measured(landmarks, frames, np.array([0, 1, -2]))
     assert late is not None and late.shape == landmarks.shape
     np.testing.assert_array_equal(late[:, 0, 0, 0], [3, 4, 5, 7])
     np.testing.assert_array_equal(late[:, 1, 1, 2], [np.nan, 3, 4, np.nan])
     np.testing.assert_array_equal(late[:, 2, 0, 1], [5, np.nan, 7, np.nan])
-    assert retimed_landmarks(landmarks, frames, np.zeros(3, np.int64)) is landmarks
-    assert retimed_landmarks(None, frames, np.array([0, 1, 0])) is None
+    assert retimed_measured(landmarks, frames, np.zeros(3, np.int64)) is landmarks
 
 
 def judged(

@@ -239,7 +239,7 @@ def test_a_run_stopped_among_the_frames_and_among_the_second_passes_is_finished(
                 raise KeyboardInterrupt
 
     def stop_at_person_1(finisher: Any, draft: Draft) -> Any:
-        if draft.member.number == 1:
+        if draft.person.number == 1:
             raise KeyboardInterrupt
         return finish_one(finisher, draft)
 

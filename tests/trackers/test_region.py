@@ -299,7 +299,7 @@ def test_person_is_searched_for_if_the_residual_stays_high(monkeypatch: pytest.M
     assert errors(estimates[1], POSES[0]).mean() > 2 * CLOSE_M
     assert len(searches) == 1 and errors(estimates[3], POSES[0]).mean() < 2 * CLOSE_M
     # residual and rendering are of the new pose
-    person = tracker.screen.sample(estimates[3].masks) >= 128
+    person = tracker.coarse_grid.sample(estimates[3].masks) >= 128
     wrong_rays = np.count_nonzero(estimates[3].drawn != person, axis=(1, 2)) / np.count_nonzero(person, axis=(1, 2))
     np.testing.assert_allclose(estimates[3].residual.sum(axis=1), wrong_rays)
     assert wrong_rays.mean() < estimates[1].residual.sum(axis=1).mean() / 2

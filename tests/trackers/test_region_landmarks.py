@@ -22,6 +22,7 @@ from tests.trackers.test_region import (
 from tests.trackers.walker import BODY, NAMES, errors, observe
 from tk.model.body.limb_candidates import exchanged, pairs, turned
 from tk.model.body.skeleton import JOINTS
+from tk.model.cues.landmarks import NAME
 
 
 def seen_at(pose: np.ndarray, noise_m: float = 0.03) -> np.ndarray:
@@ -116,7 +117,7 @@ def test_second_pass_ignores_landmarks_of_excluded_cameras() -> None:
     plain[:, 2] = np.nan
     lost = np.zeros(3, bool)
     found, same = (
-        tracker.second_pass(MASKS[:3], wrong, lost, residual, None, landmarks, keep_body=True)[0]
+        tracker.second_pass(MASKS[:3], wrong, lost, residual, None, {NAME: landmarks}, keep_body=True)[0]
         for landmarks in (spoilt, plain)
     )
     np.testing.assert_array_equal(found, same)
@@ -128,8 +129,8 @@ def test_second_pass_interpolates_the_turn_of_the_head_between_frames_with_landm
     landmarks = np.full((6, *seen_at(POSES[0])[0].shape), np.nan)
     for i in (1, 4):
         landmarks[i] = seen_at(first[i], 0.01)[0]
-    tracker = tracker_at(POSES[0])
-    poses, _, _ = tracker.second_pass(MASKS, first, np.zeros(6, bool), np.zeros((6, 3, 2)), None, landmarks, True)
+    tracker, marked = tracker_at(POSES[0]), {NAME: landmarks}
+    poses, _, _ = tracker.second_pass(MASKS, first, np.zeros(6, bool), np.zeros((6, 3, 2)), None, marked, True)
     found = np.degrees(poses[:, turn])
     np.testing.assert_allclose(found[[1, 4]], [0, 30], atol=8)
     np.testing.assert_allclose(found, np.interp(range(6), [1, 4], found[[1, 4]]), atol=1e-9)
@@ -139,8 +140,8 @@ def test_second_pass_corrects_legs_by_landmarks_of_all_cameras() -> None:
     """Legs that are exchanged in all frames: no other frame shows them right."""
     tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=0.1))
     wrong = np.stack([exchanged(pose, pairs(tracker.limbs))[1] for pose in POSES])
-    landmarks = np.stack([seen_at(pose)[0] for pose in POSES])
-    found, _, _ = tracker.second_pass(MASKS, wrong, np.zeros(6, bool), np.zeros((6, 3, 2)), None, landmarks, True)
+    marked = {NAME: np.stack([seen_at(pose)[0] for pose in POSES])}
+    found, _, _ = tracker.second_pass(MASKS, wrong, np.zeros(6, bool), np.zeros((6, 3, 2)), None, marked, True)
     off = np.linalg.norm(SKELETON.joints(found) - SKELETON.joints(POSES), axis=2).max(axis=1)
     assert (off < 3 * CLOSE_M).all()
 
@@ -150,7 +151,7 @@ def test_landmarks_decide_about_the_opposite_heading() -> None:
     tracker = tracker_at(POSES[0])
     turned = tracker.turned_pose(POSES[0])
     masks = draw_silhouettes(BODY, RIG, np.stack([POSES[0], turned])).max(axis=0)
-    assert len(tracker.headings([masks], POSES[:1], None, None)) == 2
-    assert tracker.headings([masks], POSES[:1], None, seen_at(POSES[0])) == ()
-    both = [tracker.trajectory_cost([masks], pose[None], seen_at(turned)) for pose in (POSES[0], turned)]
+    assert len(tracker.headings([masks], POSES[:1], None, {})) == 2
+    assert tracker.headings([masks], POSES[:1], None, {NAME: seen_at(POSES[0])}) == ()
+    both = [tracker.trajectory_cost([masks], pose[None], {NAME: seen_at(turned)}) for pose in (POSES[0], turned)]
     assert both[1] < both[0] - 10.0

@@ -14,7 +14,7 @@ from tk.model.cues.ray_costs import RayGrid
 from tk.people.choose import in_order
 from tk.people.find import LocatedPerson, PeopleFinder
 from tk.people.hulls import owners_by_hulls
-from tk.trackers.contour_finder import CHOICE_ROWS
+from tk.trackers.contour_finder import FINE_ROWS
 from tk.trackers.protocol import Frame
 
 Float = NDArray[np.float64]
@@ -151,7 +151,7 @@ class PeopleWatch:
         last = min(path, key=lambda look: abs(look[0] - index))[1]
         found = self._finder.find(masks)
         by_distance = sorted(found, key=lambda person: float(np.linalg.norm(person.position - last.position)))
-        grid = RayGrid(rig, CHOICE_ROWS)
+        grid = RayGrid(rig, FINE_ROWS)
         whole = Frame(index, np.empty((len(rig), 0, 0, 3), np.uint8), masks)
         return owners_by_hulls(rig, grid, by_distance, whole).share(whole, 0).masks
 

@@ -28,7 +28,7 @@ class Equations:
 
     Attributes:
         hessian: (B, D + S, D + S) JᵀWJ of each block's rows; its own unknowns come first.
-        gradient: (B, D + S) JᵀW times the residuals.
+        gradient: (B, D + S) JᵀW times the residuals, by which the rows' values should grow: the negative gradient.
         coupling: (B - 1, D, D) JᵀWJ of the unknowns of a block (rows) and of the next one (columns); None if nothing
             couples blocks.
         prior_hessian, prior_gradient: (S, S), (S,) the same of the shared unknowns' prior.
@@ -42,7 +42,7 @@ class Equations:
 
     @property
     def own(self) -> int:
-        """D."""
+        """D, the number of a block's own unknowns."""
         return self.gradient.shape[1] - len(self.prior_gradient)
 
     def add(self, block: int, columns: Sequence[slice], rows: Float, weight: Float, residual: Float) -> None:

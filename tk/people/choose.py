@@ -103,7 +103,7 @@ def chosen(
     return (number,)
 
 
-def unknown(first: Subject) -> Subject:
+def unknown_subject(first: Subject) -> Subject:
     """Return a subject of whom nothing is known but how the recording begins."""
     return Subject(in_init_pose=first.in_init_pose)
 
@@ -128,7 +128,7 @@ def matched(subjects: Sequence[Subject], people: Sequence[LocatedPerson], up: st
         who = {int(cost.argmin()): 0}
     else:
         who = dict(zip(*scipy.optimize.linear_sum_assignment(cost), strict=True))
-    return [subjects[who[p]] if p in who else unknown(subjects[0]) for p in range(len(people))]
+    return [subjects[who[p]] if p in who else unknown_subject(subjects[0]) for p in range(len(people))]
 
 
 def _position(subject: Subject) -> NDArray[np.float64] | None:

@@ -22,7 +22,7 @@ from tk.io.results.status import Status
 from tk.model.body.joints import JOINTS
 from tk.model.cues.part_colors import LearnedColors
 from tk.model.masks.image_health import described
-from tk.people.person import Person, Tracked
+from tk.people.person import Answer, Person
 
 _LOG = logging.getLogger(__name__)
 Float = NDArray[np.float64]
@@ -103,7 +103,7 @@ class Contacts:
         return ended
 
 
-def judge(contacts: Contacts, tracked: Sequence[Person], answers: Mapping[int, Tracked]) -> None:
+def judge_contacts(contacts: Contacts, tracked: Sequence[Person], answers: Mapping[int, Answer]) -> None:
     """Compare people whose contact has ended with those before it; exchange their trackers if they were mixed up.
 
     Args:

@@ -7,6 +7,9 @@ who are tracked. A person who enters is found in them. While somebody is awaited
 everybody keeps a number while away, as if all were written.
 
 A person who is alone in view gets the whole masks.
+
+A person has two numbers. `tk inspect` prints the one, and the user chooses by it: people get it in the order of
+:func:`tk.people.find.order_people`, then of entering. :attr:`Person.number` is that in the result.
 """
 
 from __future__ import annotations
@@ -28,11 +31,11 @@ from tk.model.cues.part_colors import RenderedBody
 from tk.model.cues.ray_costs import RayGrid
 from tk.model.masks.image_health import contradiction, sampled
 from tk.model.setup import Setup, Subject
-from tk.people.choose import chosen, in_order, matched, unknown
+from tk.people.choose import chosen, in_order, matched, unknown_subject
 from tk.people.find import LocatedPerson, PeopleFinder
 from tk.people.hulls import shares_by_hulls
-from tk.people.identity import EXCHANGED, UNCLEAR, Contact, Contacts, judge
-from tk.people.person import Person, PersonState, Tracked, without_pose
+from tk.people.identity import EXCHANGED, UNCLEAR, Contact, Contacts, judge_contacts
+from tk.people.person import Answer, Person, PersonState, no_pose
 from tk.people.share import PixelOwners, assign
 from tk.settings import Settings
 from tk.trackers.camera_monitor import CameraMonitor, spread_over
@@ -72,7 +75,7 @@ class People:
         setup: the scene.
         settings: all settings.
         choice: who is tracked, see :class:`tk.run.task.TrackOptions`.
-        first: a tracker.
+        first: the first person's tracker, not started yet; the others get trackers of the same method.
         note: receives messages for the user.
     """
 
@@ -96,8 +99,8 @@ class People:
         self._given: set[int] | None = None
         #: why nobody is tracked yet; empty before the first frame
         self.refusal = ""
-        share = sharing(first)
-        self._grid: RayGrid | None = None if share is None else share.choice
+        tracker = sharing(first)
+        self._grid: RayGrid | None = None if tracker is None else tracker.fine_grid
 
     def _person(self, number: int, subject: Subject, written: bool = True) -> Person:
         """Return somebody with the first tracker, whose kernels are compiled, or with another, if somebody has it."""
@@ -105,14 +108,14 @@ class People:
         return Person(number, subject, tracker, CameraMonitor(tracker, self._setup, subject), written)
 
     @property
-    def members(self) -> list[Person]:
+    def written(self) -> list[Person]:
         """The people in the result."""
-        return [member for member in self._tracked if member.written]
+        return [person for person in self._tracked if person.written]
 
     @property
     def contacts(self) -> list[Contact]:
         """The contacts of the people in the result. With somebody who is not in it, frames cannot be exchanged."""
-        numbers, found = {member.number for member in self.members}, []
+        numbers, found = {person.number for person in self.written}, []
         for contact in self._contacts.all:
             if numbers.issuperset(contact.people):
                 found.append(contact)
@@ -212,21 +215,21 @@ class People:
         subjects, self._tracked = self._setup.subjects, []
         people = [found[n] for n in numbers] if found else []
         known = matched(subjects[:1] if self._choice == "auto" else subjects, people, self._setup.up) or subjects[:1]
-        rest = [n for n, person in enumerate(found) if n not in numbers and person.views.sum() >= 2]
+        rest = [n for n, other in enumerate(found) if n not in numbers and other.views.sum() >= 2]
         shares = shares or self._shares([*people, *(found[n] for n in rest)], opening)
         for k, frames in enumerate(shares[: len(numbers)]):
-            member = self._person(len(self._tracked), known[k])
+            person = self._person(len(self._tracked), known[k])
             try:
-                member.begin(frames, people[k].height_m if people else None, opening)
+                person.begin(frames, people[k].height_m if people else None, opening)
             except CaptureError as error:
                 if self._choice != "all" or not (self._tracked or people[k + 1 :]):
                     raise
                 self._note(f"the person at {people[k].where} cannot be tracked: {error}")
             else:
-                self._tracked.append(member)
+                self._tracked.append(person)
         self._given = set(numbers)
         for n, frames in zip(rest, shares[len(people) :], strict=False):
-            if found[n].inside and self._admit(frames, found[n], unknown(subjects[0]), written=False):
+            if found[n].inside and self._admit(frames, found[n], unknown_subject(subjects[0]), written=False):
                 self._given.add(n)
 
     @cached_property
@@ -244,15 +247,16 @@ class People:
 
     def _sighted(self, frame: Frame) -> list[RenderedBody]:
         """Return the bodies that the landmarks in a frame show."""
-        share = sharing(self._first)
-        if share is None or frame.landmarks is None:
+        tracker = sharing(self._first)
+        if tracker is None or frame.landmarks is None:
             return []
-        return [body for landmarks in frame.landmarks if (body := share.sighted(landmarks)) is not None]
+        return [body for landmarks in frame.landmarks if (body := tracker.sighted(landmarks)) is not None]
 
     # --- one frame ----------------------------------------------------------------------------------------------------
 
-    def step(self, frame: Frame) -> dict[int, Tracked]:
-        """Return the answers of the people in the result, by number.
+    def step(self, frame: Frame) -> dict[int, Answer]:
+        """Step everybody's tracker with the person's share of a frame, then find who enters and leaves; return the
+        answers of the people in the result, by number.
 
         Before anybody is tracked, person 0 is absent, or lost if the first person in the volume could not be tracked.
         """
@@ -261,80 +265,84 @@ class People:
         alone = len(self._tracked) == 1 and not self._tracked[0].shows_others(frame.masks, self._setup.rig)
         owners = None if alone else self._owners(frame, ahead=True)
         answers = {}
-        for k, one in enumerate(self._tracked):
-            share = frame if owners is None else owners.share(frame, k, one.lost and not one.absent)
-            answers[one.number] = one.step(share)
+        for k, person in enumerate(self._tracked):
+            share = frame if owners is None else owners.share(frame, k, person.lost and not person.absent)
+            answers[person.number] = person.step(share)
         if owners is None:
             self._unknown.clear()
         else:
             without = np.empty((len(frame.masks), 0, 0, 3), np.uint8)  # images are views into the ring of frames
             self._unknown.append(replace(owners.unknown(frame), images=without))
-        judge(self._contacts, self._tracked, answers)
+        judge_contacts(self._contacts, self._tracked, answers)
         answers |= self._look(frame, owners)
-        for member in self._tracked:
-            if member.absent:
-                answers[member.number] = answers[member.number].absent(member.tracker)
-        return {m.number: answers[m.number] for m in self.members} or self._nobody(frame)
+        for person in self._tracked:
+            if person.absent:
+                answers[person.number] = answers[person.number].without_pose(person.tracker)
+        return {person.number: answers[person.number] for person in self.written} or self._nobody(frame)
 
     def _owners(self, frame: Frame, ahead: bool = False) -> PixelOwners:
-        """Return the owners of a frame's pixels, in the order of the members, by their bodies at the last pose, or at
-        the pose expected in the next frame if ``ahead``."""
+        """Return the owners of a frame's pixels, in the order of the people who are tracked, by their bodies.
+
+        ``ahead``: the trackers have not seen the frame yet, so the bodies are at the poses expected in it.
+        """
         assert self._grid is not None
-        bodies: list[RenderedBody | None] = [None if m.lost else m.sharing.rendered(ahead) for m in self._tracked]
+        bodies: list[RenderedBody | None] = [None if p.lost else p.sharing.rendered(ahead) for p in self._tracked]
         return assign(self._setup.rig, self._grid, bodies, frame)
 
     # --- who enters and leaves ----------------------------------------------------------------------------------------
 
-    def _look(self, frame: Frame, owners: PixelOwners | None) -> dict[int, Tracked]:
+    def _look(self, frame: Frame, owners: PixelOwners | None) -> dict[int, Answer]:
         """Find people who enter or leave, and return the answers of those who enter.
 
         ``owners``: of the frame's pixels; None if the only person got all.
         """
-        lost = [m for m in self._tracked if m.lost]
-        for member in self._tracked:
-            member.absent &= member.lost
-        if self._grid is None or not (lost or (owners is not None and frame.index % self._every == 0)):
+        lost, due = [p for p in self._tracked if p.lost], frame.index % self._every == 0
+        for person in self._tracked:
+            person.absent &= person.lost
+        if self._grid is None or not (lost or (due and owners is not None)):
             return {}
         owners = owners or self._owners(frame)
-        found, numbered = self._newcomers(frame, owners), self._choice == "all" or bool(self._awaited)
-        for member in lost:
-            if not found and member.has_left(frame.masks):
-                member.absent = True
-            elif found and not numbered:
-                member.absent = False  # no newcomer is written: who appears may be this person, and the tracker looks
-        if frame.index % self._every == 0 and not numbered:  # who is not written, and lost, comes back as a newcomer
-            self._tracked = [m for m in self._tracked if m.written or not m.lost]
-        if any(m.lost and not m.absent for m in self._tracked) or len(self._unknown) < _HISTORY:
+        newcomers, numbered = self._newcomers(frame, owners), self._choice == "all" or bool(self._awaited)
+        for person in lost:
+            if not newcomers and person.has_left(frame.masks):
+                person.absent = True
+            elif newcomers and not numbered:
+                person.absent = False  # no newcomer is written: who appears may be this person, and the tracker looks
+        if due and not numbered:  # who is not written, and lost, comes back as a newcomer
+            self._tracked = [p for p in self._tracked if p.written or not p.lost]
+        searching = any(p.lost and not p.absent for p in self._tracked)
+        if searching or len(self._unknown) < _HISTORY or frame.index < self._admit_from:
             return {}
-        if frame.index < self._admit_from:
-            return {}
-        answers: dict[int, Tracked] = {}
-        for person in found:
-            shares = self._shares([person], list(self._unknown)[::-1])[0]
-            away = [m for m in self._tracked if m.absent]
-            alike = [m.sharing.likeness(replace(shares[0], images=frame.images)) for m in away]
-            if alike and max(alike) > _SAME_COLORS:
-                away[int(np.argmax(alike))].absent = False  # the tracker finds this person in the unknown pixels
-                continue
-            assert self._given is not None
-            number = next(n for n in range(len(self._given) + 1) if n not in self._given)
-            written = self._choice == "all" or number in self._awaited
-            subject = self._subject_of(person) if written else Subject(in_init_pose=False)
-            newcomer = self._admit(shares, person, subject, written)
-            if newcomer is None:
-                continue
-            self._given.add(number)
-            answers[newcomer.number] = newcomer.step(replace(shares[0], images=frame.images))
-            if written:
-                self._note(f"frame {frame.index}: person {number} has entered")
-            else:
-                self._note(f"frame {frame.index}: another person is in view, at {person.where}")
+        answers: dict[int, Answer] = {}
+        for newcomer in newcomers:
+            answers |= self._enter(frame, newcomer)
         return answers
+
+    def _enter(self, frame: Frame, newcomer: LocatedPerson) -> dict[int, Answer]:
+        """Recognise somebody who is absent, or track somebody new; return the new person's answer by number."""
+        share = self._shares([newcomer], list(self._unknown)[::-1])[0]
+        away = [p for p in self._tracked if p.absent]
+        alike = [p.sharing.likeness(replace(share[0], images=frame.images)) for p in away]
+        if alike and max(alike) > _SAME_COLORS:
+            away[int(np.argmax(alike))].absent = False  # the tracker finds this person in the unknown pixels
+            return {}
+        assert self._given is not None
+        number = next(n for n in range(len(self._given) + 1) if n not in self._given)
+        written = self._choice == "all" or number in self._awaited
+        subject = self._subject_of(newcomer) if written else Subject(in_init_pose=False)
+        person = self._admit(share, newcomer, subject, written)
+        if person is None:
+            return {}
+        self._given.add(number)
+        who = f"person {number} has entered" if written else f"another person is in view, at {newcomer.where}"
+        answer = person.step(replace(share[0], images=frame.images))
+        self._note(f"frame {frame.index}: {who}")
+        return {person.number: answer}
 
     def _subject_of(self, person: LocatedPerson) -> Subject:
         """Return the subject of somebody who enters: the one who fits best of those that nobody has."""
         subjects = self._setup.subjects
-        free = [s for s in subjects if all(s is not member.subject for member in self._tracked)]
+        free = [s for s in subjects if all(s is not other.subject for other in self._tracked)]
         if not free:
             return Subject(in_init_pose=False)
         (fits,) = matched(free, [person], self._setup.up)
@@ -351,20 +359,20 @@ class People:
         masks = owners.unknown(frame).masks
         return [p for p in self._finder.find(masks >= PERSON, hidden=masks == OTHERS) if p.inside]
 
-    def _admit(self, frames: Sequence[Frame], person: LocatedPerson, subject: Subject, written: bool) -> Person | None:
+    def _admit(self, frames: Sequence[Frame], found: LocatedPerson, subject: Subject, written: bool) -> Person | None:
         """Add a person who is tracked from the first of some frames on; None if nobody can be tracked."""
         # people who are not written have higher numbers than all who are, now and later
         higher = len(self._choice) if isinstance(self._choice, tuple) else 1
-        number = len(self.members) if written else max([higher, *(1 + m.number for m in self._tracked)])
-        member = self._person(number, subject, written)
+        number = len(self.written) if written else max([higher, *(1 + p.number for p in self._tracked)])
+        person = self._person(number, subject, written)
         try:
-            member.begin(frames, person.height_m)
+            person.begin(frames, found.height_m)
         except CaptureError as reason:
             self._refuse(frames[0].index, reason)
             return None
         self._refused = 0
-        self._tracked.append(member)
-        return member
+        self._tracked.append(person)
+        return person
 
     def _refuse(self, frame: int, reason: CaptureError) -> None:
         """Put off the next attempt to track somebody, because the one in this frame has failed."""
@@ -373,36 +381,36 @@ class People:
         self._refused += 1
         self._admit_from = frame + self._every * min(2 ** (self._refused - 1), _LONGEST_PAUSE)
 
-    def _nobody(self, frame: Frame, lost: bool = False) -> dict[int, Tracked]:
+    def _nobody(self, frame: Frame, lost: bool = False) -> dict[int, Answer]:
         """Return the answers in a frame before anybody in the result is tracked; ``lost``: somebody is there."""
-        return {0: Tracked(without_pose(self._first, len(self._setup.rig), lost), frame, frame)}
+        return {0: Answer(no_pose(self._first, len(self._setup.rig), lost), frame, frame)}
 
     # --- what a result keeps ------------------------------------------------------------------------------------------
 
     @property
     def doubted(self) -> NDArray[np.bool_]:
         """(C,) cameras, see :attr:`CameraMonitor.doubted`."""
-        return np.any([member.monitor.doubted for member in self.members], axis=0)
+        return np.any([person.monitor.doubted for person in self.written], axis=0)
 
     def report(self) -> list[str]:
         """Return lines on excluded cameras and losses, see :meth:`CameraMonitor.report`, and on who did not come."""
         missing = [_not_entered(number) for number in sorted(self._awaited)]
-        if len(self.members) == 1:
-            return [*self.members[0].monitor.report(), *missing]
-        return [*(f"person {m.number}: {line}" for m in self.members for line in m.monitor.report()), *missing]
+        if len(self.written) == 1:
+            return [*self.written[0].monitor.report(), *missing]
+        return [*(f"person {p.number}: {line}" for p in self.written for line in p.monitor.report()), *missing]
 
     def state(self) -> PeopleState:
         """Return what :meth:`resume` needs."""
         subjects = self._setup.subjects
         tracked = [
             PersonState(
-                number=member.number,
-                subject=next((k for k, known in enumerate(subjects) if known is member.subject), None),
-                in_init_pose=member.subject.in_init_pose,
-                body=None if member.written else dict(member.tracker.model()),
-                member=member.state,
+                number=person.number,
+                subject=next((k for k, known in enumerate(subjects) if known is person.subject), None),
+                in_init_pose=person.subject.in_init_pose,
+                body=None if person.written else dict(person.tracker.model()),
+                member=person.state,
             )
-            for member in self._tracked
+            for person in self._tracked
         ]
         return PeopleState(tracked, sorted(self._given or ()), self._contacts.all)
 
@@ -414,15 +422,15 @@ class People:
             state: of :meth:`state`.
         """
         self._tracked = []
-        for person in state.tracked:
-            k, subjects = person.subject, self._setup.subjects
-            if k is not None and subjects[k].in_init_pose and not person.in_init_pose:
+        for stored in state.tracked:
+            k, subjects = stored.subject, self._setup.subjects
+            if k is not None and subjects[k].in_init_pose and not stored.in_init_pose:
                 self._begin_in_any_pose(k)
-            known = Subject(in_init_pose=person.in_init_pose) if k is None else self._setup.subjects[k]
-            member = self._person(person.number, known, written=person.body is None)
-            member.tracker.take_model(models[person.number] if person.body is None else person.body)
-            member.state = person.member
-            self._tracked.append(member)
+            known = Subject(in_init_pose=stored.in_init_pose) if k is None else self._setup.subjects[k]
+            person = self._person(stored.number, known, written=stored.body is None)
+            person.tracker.take_model(models[stored.number] if stored.body is None else stored.body)
+            person.state = stored.member
+            self._tracked.append(person)
         self._given, self._contacts.all = set(state.given), state.contacts
 
 

@@ -16,7 +16,7 @@ from tk.model.body.joints import JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.setup import Subject
 from tk.model.stateful import Stateful
-from tk.people.share import UNKNOWN
+from tk.people.share import STRANGER_SHARE
 from tk.trackers.camera_monitor import CameraMonitor, MonitorState
 from tk.trackers.protocol import Estimate, Frame, SharingTracker, Tracker, sharing, without_cameras
 from tk.trackers.reason import Reason
@@ -30,19 +30,24 @@ _ALONE_M = 0.25
 
 
 @dataclass(frozen=True)
-class Tracked:
-    """A member's answer for a frame: the estimate, the member's share of the frame in cameras whose images are right,
-    and what its tracker used."""
+class Answer:
+    """What is known of a person after a frame.
+
+    Attributes:
+        estimate: of the pose.
+        share: the person's share of the frame, in cameras whose images are right.
+        used: the part of the share that the tracker has used.
+    """
 
     estimate: Estimate
     share: Frame
     used: Frame
 
-    def absent(self, tracker: Tracker) -> Tracked:
+    def without_pose(self, tracker: Tracker) -> Answer:
         """Return the answer of somebody who is absent: the reason, and what is known of the cameras, stay."""
         names = ("found", "judged", "cameras", "shift", "timing", "iterations")
         kept = {name: getattr(self.estimate, name) for name in names}
-        return replace(self, estimate=replace(without_pose(tracker, len(self.share.masks)), **kept))
+        return replace(self, estimate=replace(no_pose(tracker, len(self.share.masks)), **kept))
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,7 @@ class PersonState:
         subject: number of the subject; None: nothing is known of the person.
         in_init_pose: whether the subject began in the initialisation pose.
         body: of a person who is not in the result; None of others.
-        member: what changes from frame to frame.
+        member: what changes from frame to frame, see :class:`PersonMotion`.
     """
 
     number: int
@@ -114,28 +119,28 @@ class Person(Stateful[PersonMotion]):
         self.tracker.start(seen, replace(self.subject, hull_m=hull_m))
         self.monitor.check_body()
 
-    def step(self, share: Frame) -> Tracked:
+    def step(self, share: Frame) -> Answer:
         """Return the answer for this person's share of the next frame."""
         estimate, used = self.monitor.step(share)
         self.lost = estimate.status == "lost"
         if not self.lost:
             self.drawn, self.place = estimate.drawn, estimate.joints.mean(axis=0)
-        return Tracked(estimate, without_cameras(share, self.monitor.unfit), used)
+        return Answer(estimate, without_cameras(share, self.monitor.unfit), used)
 
     def shows_others(self, masks: NDArray[np.uint8], rig: Rig) -> bool:
         """Return whether masks (C, H, W) show more than this person: pixels far from the last body."""
         tracker = sharing(self.tracker)
         if tracker is None or self.lost or self.drawn is None or self.place is None:
             return False
-        shown = tracker.screen.sample(masks) >= PERSON
+        shown = tracker.coarse_grid.sample(masks) >= PERSON
         for camera, cells, body in zip(rig, shown, self.drawn, strict=True):
             area = np.count_nonzero(body)
-            if np.count_nonzero(cells) <= (1 + UNKNOWN) * area:
+            if np.count_nonzero(cells) <= (1 + STRANGER_SHARE) * area:
                 continue
-            reach = _ALONE_M * camera.pixels_per_metre(self.place) / tracker.screen.step
+            reach = _ALONE_M * camera.pixels_per_metre(self.place) / tracker.coarse_grid.step
             size = 2 * max(round(reach), 1) + 1
             near = cv2.dilate(body.view(np.uint8), np.ones((size, size), np.uint8)) > 0
-            if np.count_nonzero(cells & ~near) > UNKNOWN * area:
+            if np.count_nonzero(cells & ~near) > STRANGER_SHARE * area:
                 return True
         return False
 
@@ -148,12 +153,12 @@ class Person(Stateful[PersonMotion]):
         body = self.drawn
         if body is None:
             return False
-        sampled = self.sharing.screen.sample(masks)
+        sampled = self.sharing.coarse_grid.sample(masks)
         covered = np.count_nonzero(body, axis=(1, 2))
         return bool((np.count_nonzero(body & (sampled < PERSON), axis=(1, 2)) >= 0.5 * covered).all())
 
 
-def without_pose(tracker: Tracker, views: int, lost: bool = False) -> Estimate:
+def no_pose(tracker: Tracker, views: int, lost: bool = False) -> Estimate:
     """Return the estimate of a tracker for somebody who is absent in some views, or ``lost``."""
     return Estimate(
         pose=np.full(len(tracker.pose_names), np.nan),

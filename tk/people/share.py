@@ -47,7 +47,7 @@ REACH_M = 0.5
 _AVERAGED_PX = 3
 # A view shows somebody unknown if a connected region that is not near has this share of a person's area. A fast arm
 # that is not where it is expected has 0.05.
-UNKNOWN = 0.1
+STRANGER_SHARE = 0.1
 # A network's masks of single people are further evidence: of a pixel, a person's mask is right with this probability.
 RIGHT_MASK = 0.95
 # Where somebody unknown ends is unknown, too: within this distance of the region, metres: half a trunk, and NEAR_M.
@@ -126,7 +126,7 @@ class _Shape(NamedTuple):
 
 
 def assign(
-    rig: Rig, grid: RayGrid, bodies: Sequence[RenderedBody | None], frame: Frame, unknown: float = UNKNOWN
+    rig: Rig, grid: RayGrid, bodies: Sequence[RenderedBody | None], frame: Frame, stranger_share: float = STRANGER_SHARE
 ) -> PixelOwners:
     """Return the owner of each pixel of the masks.
 
@@ -135,12 +135,12 @@ def assign(
         grid: the cells.
         bodies: of each person the body, or the hull, on the grid; None if it is unknown where the person is.
         frame: images and masks. Pixels with values below 128 have no owner.
-        unknown: see :data:`UNKNOWN`.
+        stranger_share: see :data:`STRANGER_SHARE`.
     """
     shown = grid.sample(frame.masks) >= PERSON
     owner = np.full(frame.masks.shape, NOBODY, np.int8)
     areas = [np.count_nonzero(body.label, axis=(1, 2)) for body in bodies if body is not None]
-    least = unknown * float(np.median(areas)) if areas else 0.0
+    least = stranger_share * float(np.median(areas)) if areas else 0.0
     claims = _claims(grid, frame, bodies, shown)
     colored = frame.images.size > 0 and any(body is not None and body.log_likelihood is not None for body in bodies)
     for v, camera in enumerate(rig):

@@ -15,7 +15,7 @@ from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.bundle import TrackedPoses
 from tk.model.cameras.camera import Rig
 from tk.model.cues.ray_costs import RayGrid, residual_of
-from tk.trackers.contour_finder import SCREEN_ROWS
+from tk.trackers.contour_finder import COARSE_ROWS
 
 # Whole frames of a video's delay that are tried before the refinement, whose edges reach some pixels only; and the
 # frames in which they are tried. A delay at the edge of the range is no optimum: the range is then doubled, at most to
@@ -42,7 +42,7 @@ def whole_delays(people: Sequence[TrackedPerson], rig: Rig) -> NDArray[np.int64]
     The bodies explain the masks of a late video worse than those of the others, and those of some frames earlier well.
     The cameras are in the world of the poses.
     """
-    grid = RayGrid(rig, SCREEN_ROWS)
+    grid = RayGrid(rig, COARSE_ROWS)
     shares_of = [_shares_by_delay(person, grid, -(-DELAY_FRAMES // len(people))) for person in people]
     late, unknown, reach = np.zeros(len(rig), np.int64), np.ones(len(rig), np.bool_), REACH
     while unknown.any() and reach <= MOST:
@@ -116,17 +116,13 @@ def retimed(store: MaskStore, frames: NDArray[np.int64], late: NDArray[np.int64]
     return result
 
 
-def retimed_landmarks(
-    landmarks: NDArray[np.float64] | None, frames: NDArray[np.int64], late: NDArray[np.int64]
-) -> NDArray[np.float64] | None:
-    """Return the landmarks (F, C, L, 4) of frames (F,) of cameras that are late by whole frames (C,); NaN if a camera
-    has no image."""
-    if landmarks is None or not late.any():
-        return landmarks
-    result = np.full(landmarks.shape, np.nan)
-    row = {frame: i for i, frame in enumerate(frames.tolist())}
-    for c, n in enumerate(late.tolist()):
-        for i, frame in enumerate(frames.tolist()):
-            if frame - n in row:
-                result[i, c] = landmarks[row[frame - n], c]
-    return result
+def retimed_measured(
+    measured: NDArray[np.float64], frames: NDArray[np.int64], late: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return what was measured (F, C, N, K) in frames (F,) by cameras that are late by whole frames (C,); NaN if a
+    camera has no image."""
+    if not late.any():
+        return measured
+    shown = frames[:, None] - late
+    row = np.searchsorted(frames, shown).clip(max=len(frames) - 1)
+    return np.where((frames[row] == shown)[..., None, None], measured[row, np.arange(len(late))], np.nan)

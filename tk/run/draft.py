@@ -15,7 +15,7 @@ from tk.io.results.revision import Revision
 from tk.io.results.status import Status
 from tk.people.identity import COLUMNS
 from tk.people.person import Person
-from tk.run.second_run import Used
+from tk.run.second_run import TrackerAndMasks
 from tk.trackers.protocol import Estimate, Tracker, two_pass
 
 
@@ -24,7 +24,7 @@ class Draft:
     """A person's result while it is finished.
 
     Attributes:
-        member: the person.
+        person: whose result it is.
         result: of the first pass.
         tracker: with the body and the cameras as they are now.
         lost: (F,) frames without a pose.
@@ -34,7 +34,7 @@ class Draft:
         refined: whether the second pass has changed the body.
     """
 
-    member: Person
+    person: Person
     result: Result
     tracker: Tracker
     lost: NDArray[np.bool_]
@@ -44,7 +44,7 @@ class Draft:
     refined: bool = False
 
     @property
-    def used(self) -> Used:
+    def tracker_and_masks(self) -> TrackerAndMasks:
         """The tracker, which has a second pass, and the masks."""
         tracker = two_pass(self.tracker)
         assert tracker is not None and self.masks is not None
@@ -58,7 +58,7 @@ class Draft:
         """Return one of :data:`~tk.people.identity.COLUMNS` as it is now; None if the result has none."""
         return self.columns.get(dataset, getattr(self.result, COLUMNS[dataset]))
 
-    def replace(self, rows: NDArray[np.int64], estimates: Sequence[Estimate]) -> None:
+    def take(self, rows: NDArray[np.int64], estimates: Sequence[Estimate]) -> None:
         """Take other estimates for some frames; the first frame stays "initialised"."""
         evidence = ("reason", "found", "origin", "sigma", "camera")
         datasets = ("pose", "residual", "objective", *(f"evidence/{name}" for name in evidence))

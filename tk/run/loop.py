@@ -21,7 +21,7 @@ from tk.io.results.reader import as_damage_error, read_result
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
 from tk.people.people import People, PeopleState
-from tk.people.person import Tracked
+from tk.people.person import Answer
 from tk.run.offline import REFINED
 from tk.run.plan import Plan
 from tk.run.prefetch import Observed
@@ -79,7 +79,7 @@ class Loop:
     """Steps the trackers of a run through its source, and writes their estimates.
 
     Attributes:
-        tracked: number of frames, even if the run is interrupted.
+        written: number of frames in the file that this loop has added, even if the run is interrupted.
         people: who is tracked.
     """
 
@@ -91,12 +91,12 @@ class Loop:
         masks: MaskStores | None = None,
     ) -> None:
         self.plan, self.output, self.masks, self._note = plan, output, masks, note
-        self.tracked = 0
+        self.written = 0
         self._held: list[tuple[Row, dict[int, Row]]] = []  # of frames that are not in the file yet
         task = plan.task
         self.people = People(task.setup, task.settings, task.options.people, plan.tracker, note)
 
-    def frames(self) -> Iterator[tuple[Estimate, ...]]:
+    def estimates(self) -> Iterator[tuple[Estimate, ...]]:
         """Start or restore the trackers, step them to the end and yield the estimates of all people in each frame; they
         are in the file already, except those before the first person, which are written with that person's first frame.
 
@@ -119,7 +119,7 @@ class Loop:
         _LOG.info("reading the first frames and learning what the scene looks like")
         plan.tracker.prepare()
         yield from self._step_through(self._started(observations, count))
-        if not self.people.members:
+        if not self.people.written:
             raise CaptureError(f"{plan.task.source.where}: nobody could be tracked: {self.people.refusal}")
 
     def _started(self, observations: Iterator[Observed], count: int) -> Iterator[Observed]:
@@ -181,7 +181,8 @@ class Loop:
         """Step the trackers to the end; estimates are yielded when they are in the file."""
         output, stop = self.output, self.plan.stop
         finished: list[tuple[Estimate, ...]] = []
-        written, writing = -np.inf, 0.0  # the first frame is written at once
+        # when the file was last written (the first frame at once), and how long it took after the frame before
+        written, writing = -np.inf, 0.0
         try:
             for observation, laps in observations:
                 if stop is not None and observation.index >= stop:
@@ -196,7 +197,7 @@ class Loop:
                 if output:
                     rows = {e.person: _row(e, self.plan.task.options.store_hull) for e in estimates}
                     self._held.append((_run_row(estimates, {**laps, "total": total}), rows))
-                    if self.people.members:
+                    if self.people.written:
                         self._write(output, due)
                 finished.append(tuple(replace(e, timing={**laps, **e.timing, "total": total}) for e in estimates))
                 writing = time.perf_counter() - stepped
@@ -205,21 +206,21 @@ class Loop:
                     yield from finished
                     finished.clear()
         except TkError:  # frames before the broken one count
-            yield from self._written(finished)
+            yield from self._flushed(finished)
             raise
-        yield from self._written(finished)
+        yield from self._flushed(finished)
 
     def _write(self, output: Output, flush: bool) -> None:
         """Write the frames that are not in the file yet, and the bodies of people whose trackers have just started."""
         models = output.writer.models
-        for member in self.people.members:
-            if member.number >= len(models) or not models[member.number]:
-                output.writer.write_model(member.tracker.model(), person=member.number)
+        for person in self.people.written:
+            if person.number >= len(models) or not models[person.number]:
+                output.writer.write_model(person.tracker.model(), person=person.number)
         *earlier, last = self._held
         for before in earlier:
             output.writer.append(*before, flush=False)
         output.writer.append(*last, self._state(output), flush=flush)
-        self.tracked += len(self._held)
+        self.written += len(self._held)
         self._held.clear()
 
     def _step(self, observation: Frame) -> tuple[Estimate, ...] | None:
@@ -243,7 +244,7 @@ class Loop:
             found.append(whole)
         return tuple(found)
 
-    def _kept(self, answer: Tracked) -> NDArray[np.uint8]:
+    def _kept(self, answer: Answer) -> NDArray[np.uint8]:
         """Return the cleaned masks (C, H, W) of a frame, also of cameras that disagree: they may be refined."""
         tracker = two_pass(self.plan.tracker)
         assert tracker is not None
@@ -254,8 +255,9 @@ class Loop:
             taken[out] = tracker.cleaned(answer.share.masks[out])
         return taken
 
-    def _written(self, finished: list[tuple[Estimate, ...]]) -> Iterator[tuple[Estimate, ...]]:
-        if self.output and self.tracked:
+    def _flushed(self, finished: list[tuple[Estimate, ...]]) -> Iterator[tuple[Estimate, ...]]:
+        """Yield the estimates that are finished, after they are in the file."""
+        if self.output and self.written:
             self.output.writer.flush()
         yield from finished
 

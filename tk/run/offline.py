@@ -10,18 +10,20 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.captures.mask_store import MaskStore, MaskStores
+from tk.io.captures.mask_store import MaskStores
 from tk.io.results.data import Result, UsedCameras
 from tk.io.results.revision import Revision
 from tk.io.results.status import Status
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.bundle import TrackedPoses
 from tk.model.cameras.camera import Rig
+from tk.model.cues import landmarks
+from tk.model.cues.cue import Measured, in_frames
 from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
 from tk.people.identity import COLUMNS, doubtful, exchanged, exchanged_masks, report
 from tk.people.people import People
-from tk.run.delays import TrackedPerson, retimed, retimed_landmarks
+from tk.run.delays import TrackedPerson, retimed, retimed_measured
 from tk.run.draft import Draft, held, without_absent
 from tk.run.prefetch import open_observations
 from tk.run.refinement import compare_cameras, refine_if_inconsistent
@@ -74,26 +76,26 @@ def finish(
         note: receives lines for the user.
         within: receives the share of a long stage that is done.
     """
-    members, contacts = people.members, people.contacts
-    kept = [held(person) for person in found]
+    written, contacts = people.written, people.contacts
+    kept = [held(result) for result in found]
     results = exchanged(kept, contacts)
     for line in report(contacts):
         note(line)
     drafts = []
-    for member in members:
-        result = results[member.number]
-        draft = Draft(member, result, member.tracker, ~result.has_pose, result.has_pose & doubtful(result, contacts))
-        if result is not kept[member.number]:
+    for person in written:
+        result = results[person.number]
+        draft = Draft(person, result, person.tracker, ~result.has_pose, result.has_pose & doubtful(result, contacts))
+        if result is not kept[person.number]:
             columns = {dataset: getattr(result, name) for dataset, name in COLUMNS.items()}
             draft.columns = {dataset: values for dataset, values in columns.items() if values is not None}
         if masks is not None:
-            draft.masks = exchanged_masks(member.number, contacts, masks, result.frames)
+            draft.masks = exchanged_masks(person.number, contacts, masks, result.frames)
         drafts.append(draft)
-    revisions, finisher = {}, _Finisher(task, len(members) == 1, note, within, task.setup.rig)
+    revisions, finisher = {}, _Finisher(task, len(written) == 1, note, within, task.setup.rig)
     if people.has_segments:
         finisher.second_pass([draft for draft in drafts if finisher.has_masks(draft)])
     for draft in drafts:
-        number, reasons = draft.member.number, draft.current("evidence/reason")
+        number, reasons = draft.person.number, draft.current("evidence/reason")
         if people.has_segments:
             revisions[number] = without_absent(finisher.revision(draft), draft.result.status == Status.ABSENT)
             reasons = draft.current("evidence/reason")
@@ -149,7 +151,7 @@ class _Finisher:
         missing = [frame for frame in result.frames[~absent].tolist() if frame not in masks]
         if missing and not self.alone:
             self.note(
-                f"person {draft.member.number}: the second pass is omitted, because an earlier run kept no masks of "
+                f"person {draft.person.number}: the second pass is omitted, because an earlier run kept no masks of "
                 "each person"
             )
             return False
@@ -167,12 +169,11 @@ class _Finisher:
         if not drafts:
             return
         for draft in drafts if self.alone else ():
-            subject = draft.member.subject
-            if subject.init is None:  # a given pose shows where the front is
-                draft.tracker = self._with_true_heading(*draft.used, draft, subject.height_m)
+            if draft.person.subject.init is None:  # a given pose shows where the front is
+                draft.tracker = self._with_true_heading(draft)
         self._refine_cameras(drafts)
         for draft in drafts:
-            (tracker, masks), subject = draft.used, draft.member.subject
+            (tracker, masks), subject = draft.tracker_and_masks, draft.person.subject
             _LOG.info("second pass")
             poses, residual, precise = tracker.second_pass(
                 masks.sequence(draft.result.frames),
@@ -180,7 +181,7 @@ class _Finisher:
                 draft.lost,
                 draft.current("residual"),
                 subject.height_m,
-                self._landmarks(draft, self.late),
+                self._measured(draft, self.late),
                 draft.current("evidence/modes"),
                 keep_body=subject.body is not None,
                 report=self.within,
@@ -190,28 +191,25 @@ class _Finisher:
             draft.columns |= {"pose": poses, "residual": residual, "evidence/sigma": sigma}
             draft.refined = True
 
-    def _with_true_heading(
-        self, tracker: TwoPassTracker, masks: MaskStore, draft: Draft, height_m: float | None
-    ) -> TwoPassTracker:
+    def _with_true_heading(self, draft: Draft) -> TwoPassTracker:
         """If the opposite heading is not improbable, by all frames, track the person again with it and its body; keep
-        the more probable one. Return the tracker of the heading that is kept.
+        the more probable one in the draft. Return the tracker of the heading that is kept.
 
         A few views of a person who stands upright at the start hardly show where the front is; a whole recording does.
         Turned poses are worse than tracked ones. So they may refute the opposite heading, not confirm it.
         """
+        (tracker, masks), height_m = draft.tracker_and_masks, draft.person.subject.height_m
         rows = np.flatnonzero(~draft.lost)
         if not len(rows) or self.task.source.frame_count is None:
             return tracker
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, HEADING_FRAMES).round().astype(int))]
         poses, unused = draft.current("pose"), np.isnan(draft.current("residual")[..., 0])
-        landmarks = self._landmarks(draft, self.late)
+        measured = self._measured(draft, self.late)
 
-        def seen(rows: NDArray[np.int64]) -> tuple[list[NDArray[np.uint8]], Float | None]:
-            """Return the masks and landmarks of frames by the cameras that were used."""
+        def seen(rows: NDArray[np.int64]) -> tuple[list[NDArray[np.uint8]], Measured]:
+            """Return the masks of frames, and what was measured in them, by the cameras that were used."""
             shown = [np.where(unused[row][:, None, None], 0, masks.get(int(draft.result.frames[row]))) for row in rows]
-            return shown, None if landmarks is None else np.where(
-                unused[rows][..., None, None], np.nan, landmarks[rows]
-            )
+            return shown, in_frames(measured, rows, ~unused[rows])
 
         def cost(tracker: TwoPassTracker, poses: Float, one: Draft) -> float:
             """Return the cost of poses (F, D) after a second pass, of the frames that neither draft has lost."""
@@ -222,28 +220,28 @@ class _Finisher:
                 one.lost,
                 residual,
                 height_m,
-                landmarks,
+                measured,
                 keep_body=True,
                 report=self.within,
             )
-            shown, marked = seen(both)
-            return tracker.trajectory_cost(shown, again[0][both], marked)
+            shown, known = seen(both)
+            return tracker.trajectory_cost(shown, again[0][both], known)
 
-        shown, marked = seen(rows)
-        headings = tracker.headings(shown, poses[rows], height_m, marked)
+        shown, known = seen(rows)
+        headings = tracker.headings(shown, poses[rows], height_m, known)
         if not headings:
             return tracker
         present, opposite = headings
         _LOG.info("comparing both headings: which way the person faces is unclear")
         turned = np.array([tracker.turned_pose(pose) for pose in poses])
-        known = cost(present, poses, draft)
-        if cost(opposite, turned, draft) > known + DROPPED:
+        least = cost(present, poses, draft)
+        if cost(opposite, turned, draft) > least + DROPPED:
             return tracker
         _LOG.info("tracking with the opposite heading")
         opposite.start_at(turned[np.flatnonzero(draft.result.status != Status.ABSENT)[0]])
         again, yaw = self._tracked_by(opposite, draft, unused), tracker.body.skeleton.index("torso_yaw")
         found, both = again.current("pose"), ~(draft.lost | again.lost)
-        if cost(opposite, found, again) >= known or np.median(np.cos(found[both, yaw] - poses[both, yaw])) > 0:
+        if cost(opposite, found, again) >= least or np.median(np.cos(found[both, yaw] - poses[both, yaw])) > 0:
             return tracker  # or it may have found the other heading by itself
         draft.lost, draft.columns = again.lost, again.columns
         self.note("the person faces the other way than the first frames seemed to show: tracked again")
@@ -266,7 +264,7 @@ class _Finisher:
                     found.append(replace(judge.judge(frame.index, estimate), masks=None, drawn=None))
                     self.within(len(found) / len(rows))
         again = draft.copy()
-        again.replace(present, found)
+        again.take(present, found)
         return again
 
     def _refine_cameras(self, drafts: Sequence[Draft]) -> None:
@@ -276,7 +274,7 @@ class _Finisher:
         A camera that has been moved during the recording has no one place and is not compared.
         """
         _LOG.info("second pass: comparing the cameras")
-        tracker = drafts[0].used[0]
+        tracker = drafts[0].tracker_and_masks[0]
         world, people = tracker.world, [self._seen(draft) for draft in drafts]
         agreement = compare_cameras(people, tracker.views)
         if apart := "" if agreement is None else agreement.contradiction:
@@ -301,25 +299,25 @@ class _Finisher:
             draft.tracker, draft.masks = changed.tracker, changed.masks
             draft.lost, draft.columns = changed.lost, changed.columns
             for line in lines:
-                self.note(line if self.alone else f"person {draft.member.number}: {line}")
+                self.note(line if self.alone else f"person {draft.person.number}: {line}")
 
     def _seen(self, draft: Draft) -> TrackedPerson:
         """Return what the cameras are compared by."""
-        tracker, masks = draft.used
+        tracker, masks = draft.tracker_and_masks
         poses = tracker.world.poses_in(draft.current("pose"))
-        compared = masks.without(draft.member.monitor.moved)
+        compared = masks.without(draft.person.monitor.moved)
         return TrackedPerson(
             tracker.body, lru_cache(16)(compared.get), TrackedPoses(draft.result.frames, poses, ~draft.lost)
         )
 
-    def _landmarks(self, draft: Draft, late: NDArray[np.int64]) -> NDArray[np.float64] | None:
-        """Return the landmarks (F, C, L, 4) of a draft, in pixels of the cameras in use, synchronised with videos that
-        are late by whole frames (C,); None if it has none."""
+    def _measured(self, draft: Draft, late: NDArray[np.int64]) -> Measured:
+        """Return what the first pass has measured in the frames of a draft, in pixels of the cameras in use,
+        synchronised with videos that are late by whole frames (C,)."""
         found, depth = draft.current("landmarks"), draft.current("landmark_depth")
         if found is None or depth is None:
-            return None
-        found = np.concatenate([found, depth[..., None]], axis=-1)
-        return retimed_landmarks(self.task.setup.rig.reduced_pixels(found), draft.result.frames, late)
+            return {}
+        found = self.task.setup.rig.reduced_pixels(np.concatenate([found, depth[..., None]], axis=-1))
+        return {landmarks.NAME: retimed_measured(found, draft.result.frames, late)}
 
     def _with_cameras(self, draft: Draft, rig: Rig, late: NDArray[np.int64]) -> tuple[Draft, list[str]] | None:
         """Return a draft with other cameras, and without delays, (C,) frames, and lines for the user. The person is
@@ -329,24 +327,23 @@ class _Finisher:
         With several people, the pixels of each are known with the delays only. A source that cannot be read again is
         not tracked again.
         """
-        task, result, (tracker, masks) = self.task, draft.result, draft.used
+        task, result, (tracker, masks) = self.task, draft.result, draft.tracker_and_masks
         now = tracker.with_cameras(rig), retimed(masks, result.frames, late)
         again = replace(draft.copy(), tracker=now[0], masks=now[1])
-        first = Run.of(draft.used, result.frames, draft, np.flatnonzero(result.status != Status.ABSENT))
+        first = Run.of(draft.tracker_and_masks, result.frames, draft, np.flatnonzero(result.status != Status.ABSENT))
         out = first.left_out()
         source = task.source.shifted((np.array(task.source.time_offset_s) + late / task.setup.fps).tolist())
         if source is None or source.frame_count is None or not (self.alone if late.any() else out.any()):
             return again, []
         _LOG.info("tracking again with the refined cameras")
-        seen = self._landmarks(draft, late)
-        landmarks = {} if seen is None else dict(zip(result.frames.tolist(), seen, strict=True))
-        landmarks = {frame: own for frame, own in landmarks.items() if np.isfinite(own).any()}
-        done = track_again(first, now, source, task.setup, draft.member.subject, landmarks, self.within)
+        seen = self._measured(draft, late).get(landmarks.NAME, ())
+        marked = {n: own for n, own in zip(result.frames.tolist(), seen, strict=False) if np.isfinite(own).any()}
+        done = track_again(first, now, source, task.setup, draft.person.subject, marked, self.within)
         if done is None:
             return None
         found, monitor = done
         rows = np.flatnonzero(np.isin(result.frames, list(found)))
-        again.replace(rows, [found[int(frame)] for frame in result.frames[rows]])
+        again.take(rows, [found[int(frame)] for frame in result.frames[rows]])
         if not explains_better(Run.of(now, result.frames, again, rows), first):
             return None
         lines = ["tracking again: the images of the first pass were not synchronised"] if late.any() else []

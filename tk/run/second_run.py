@@ -21,7 +21,7 @@ from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.cues.ray_costs import RayGrid, residual_of
 from tk.model.setup import InitPose, Setup, Subject
 from tk.trackers.camera_monitor import CameraMonitor
-from tk.trackers.contour_finder import SCREEN_ROWS
+from tk.trackers.contour_finder import COARSE_ROWS
 from tk.trackers.protocol import Estimate, Frame, TwoPassTracker, shows_person
 
 Float = NDArray[np.float64]
@@ -33,7 +33,7 @@ _COMPARED = 40
 _LEFT_OUT = 0.1
 
 
-Used = tuple[TwoPassTracker, MaskStore]
+TrackerAndMasks = tuple[TwoPassTracker, MaskStore]
 """A tracker with the cameras of a run, and the masks of the frames with the delays of the run."""
 
 
@@ -52,7 +52,7 @@ class Run:
     """The frames of a run in which the person is present.
 
     Attributes:
-        tracker, masks: see :data:`Used`.
+        tracker, masks: see :data:`TrackerAndMasks`.
         frames: (F,) numbers of the frames.
         poses: (F, D) in the setup's world.
         lost: (F,) frames without a pose.
@@ -67,7 +67,7 @@ class Run:
     residual: Float
 
     @classmethod
-    def of(cls, used: Used, frames: NDArray[np.int64], found: Found, rows: NDArray[np.int64]) -> Run:
+    def of(cls, used: TrackerAndMasks, frames: NDArray[np.int64], found: Found, rows: NDArray[np.int64]) -> Run:
         """Return some rows of what a run has found in frames (F,)."""
         pose, residual = (found.current(dataset)[rows] for dataset in ("pose", "residual"))
         return cls(*used, frames[rows], pose, found.lost[rows], residual)
@@ -85,7 +85,7 @@ class Run:
         """Return (N, C) E_S of some frames (N,) by all cameras, at most 1; 1 in lost frames, NaN where nobody is
         seen."""
         tracker = self.tracker
-        grid = RayGrid(tracker.world.rig, SCREEN_ROWS)
+        grid = RayGrid(tracker.world.rig, COARSE_ROWS)
         rows = np.searchsorted(self.frames, frames)
         poses = tracker.world.poses_in(self.poses[rows])
         found = np.empty((len(frames), len(grid.rig)))
@@ -111,7 +111,7 @@ def explains_better(second: Run, first: Run) -> bool:
 
 def track_again(
     first: Run,
-    now: Used,
+    now: TrackerAndMasks,
     source: Source,
     setup: Setup,
     subject: Subject,

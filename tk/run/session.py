@@ -128,23 +128,23 @@ def track_task(
     with open_plan(task, note, film) as plan:
         meta = plan.meta()
         writer, done = ResultWriter.resume(output, meta) if resume else (ResultWriter.create(output, meta), 0)
-        again = not causal and plan.tracker.has_second_pass  # the second pass needs the masks
+        second_pass = not causal and plan.tracker.has_second_pass
         stores = MaskStores(output, bool(done))
-        if not (done or again):
-            stores.remove()  # of a stopped run; with a second pass, the first frame replaces them
-        masks = stores if again else None
+        if not (done or second_pass):
+            stores.remove()  # of a stopped run; for a second pass, the first frame replaces them
+        masks = stores if second_pass else None  # it needs those of all frames
         loop = Loop(plan, note, Output(writer, done, plan.origin()), masks)
         started = time.perf_counter()
         interrupted = False
         try:
             with writer:
                 reporter.begin(plan.total, min(done, plan.total) if plan.total else done)
-                for frame, estimates in enumerate(loop.frames(), plan.begin + done):
+                for frame, estimates in enumerate(loop.estimates(), plan.begin + done):
                     reporter.advance(frame, estimates[0] if estimates else None)
-            if loop.tracked or loop.restore_unfinished(output):
+            if loop.written or loop.restore_unfinished(output):
                 damaged: Sequence[str] = ()  # images that may be the cause
                 if (doubted := loop.people.doubted).any():
-                    damaged = task.source.damaged(plan.begin + done + loop.tracked, doubted)
+                    damaged = task.source.damaged(plan.begin + done + loop.written, doubted)
                 for line in (*damaged, *loop.people.report()):
                     note(line)
                 found = read_result(output).people
@@ -157,11 +157,11 @@ def track_task(
             # caught outside the writer, which then keeps an older result if no frame is finished
             interrupted = True
         finally:
-            if not done + loop.tracked:
+            if not done + loop.written:
                 stores.remove()
-        tracks = read_people(output) if done + loop.tracked else ()
+        tracks = read_people(output) if done + loop.written else ()
         status = [track.status for track in tracks if track.status is not None] or [np.zeros(0, np.uint8)]
-        return Summary(np.concatenate(status), time.perf_counter() - started, loop.tracked, interrupted, len(status))
+        return Summary(np.concatenate(status), time.perf_counter() - started, loop.written, interrupted, len(status))
 
 
 def estimates(task: Task, note: Callable[[str], None] = lambda _: None) -> Iterator[Estimate]:
@@ -176,7 +176,7 @@ def estimates(task: Task, note: Callable[[str], None] = lambda _: None) -> Itera
     with open_plan(task, note) as plan:
         loop = Loop(plan, note)
         found: defaultdict[int, dict[int, int]] = defaultdict(dict)  # reasons by frame, by person
-        for estimate in chain.from_iterable(loop.frames()):
+        for estimate in chain.from_iterable(loop.estimates()):
             if estimate.reason:
                 found[estimate.person][estimate.frame] = estimate.reason
             yield estimate

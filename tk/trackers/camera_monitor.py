@@ -246,11 +246,11 @@ class CameraMonitor(Stateful[MonitorState]):
         if not used.all():
             masks = masks.copy()
             masks[~used] = tracker.cleaned(frame.masks[~used])
-        sampled = tracker.screen.sample(masks)
+        sampled = tracker.coarse_grid.sample(masks)
         person, others = sampled >= PERSON, sampled == OTHERS
         residual = residual_of(drawn, person, others)
         if frame.uncertain is not None:
-            excused = residual_of(drawn & tracker.screen.sample(frame.uncertain), person, others)[:, 0]
+            excused = residual_of(drawn & tracker.coarse_grid.sample(frame.uncertain), person, others)[:, 0]
             residual[:, 0] -= np.where(excused < _TOO_LITTLE, excused, 0.0)
         return residual
 

@@ -31,8 +31,8 @@ from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import spread_out
 from tk.model.cameras.landmark_agreement import consensus
 from tk.model.cameras.tracker_frame import TrackerFrame
+from tk.model.cues import landmarks
 from tk.model.cues.cue import Cue
-from tk.model.cues.landmarks import LandmarkCue, of_person, propose
 from tk.model.cues.part_colors import PartColors, RenderedBody
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Pyramid, Views
@@ -61,11 +61,13 @@ INFORMATION = 1.0 / (2.0**2 * CORRELATION_PX)
 # cameras of sixteen the mean error of the joints changes by less than 0.1 cm. The body is fitted with all of them.
 OPENING_CAMERAS = 8
 # Rows of the grid of rays: to screen many candidates of a limb, and to choose among few poses.
-SCREEN_ROWS, CHOICE_ROWS = 54, 96
+COARSE_ROWS, FINE_ROWS = 54, 96
 LINE_SEARCH = SearchSettings()
 # Half this tolerance, or none, leaves the mean joint error on eight captures unchanged to 0.02 cm; twice as much makes
 # fast arms worse by 0.1 cm.
 SOLVER = GaussNewtonSettings(scales=3, relaxation=1.6, tolerance=0.012)
+#: the cues by their names, in the order in which their terms are added
+CUES: Mapping[str, Callable[[Rig, ConeBody, Float], Cue]] = {landmarks.NAME: landmarks.LandmarkCue}
 
 
 @dataclass(frozen=True)
@@ -74,8 +76,8 @@ class Seen:
 
     Attributes:
         frame: the frame.
-        pyramid: its silhouettes, and the person's landmarks.
-        evidence: its costs on the grid :attr:`ContourFinder.screen`.
+        pyramid: its silhouettes, and what was measured of the person.
+        evidence: its costs on the grid :attr:`ContourFinder.coarse_grid`.
         images: as in :meth:`ContourFinder.settle`.
     """
 
@@ -114,7 +116,7 @@ class ContourFinder:
         self.rig, self.up, self.fps, self.seed = rig, up, fps, seed
         self.world = TrackerFrame.of(rig, up)
         self.views = Views(self.world.rig)
-        self.screen, self.choice = (RayGrid(self.world.rig, rows) for rows in (SCREEN_ROWS, CHOICE_ROWS))
+        self.coarse_grid, self.fine_grid = (RayGrid(self.world.rig, rows) for rows in (COARSE_ROWS, FINE_ROWS))
         skeleton = build_skeleton(AVERAGE_BODY)
         self.pose_names, self.pose_units = skeleton.names, skeleton.units
         self._body: ConeBody | None = None
@@ -160,7 +162,7 @@ class ContourFinder:
         seen = self.views.pyramid(empty, 1, False)
         pose = np.zeros((1, len(body.skeleton.names)))
         normal_equations(body.arrays, self.views.at(seen, 0), pose, self.line_search)
-        Evidence.of(self.screen, empty).mismatch(body, pose)
+        Evidence.of(self.coarse_grid, empty).mismatch(body, pose)
 
     # --- initialisation (silhouette paper, section 4.6) ---------------------------------------------------------
 
@@ -222,12 +224,12 @@ class ContourFinder:
         if some.frame_shape != rig.frame_shape:  # their images would have another size
             yield frames, pyramids
             return
-        whole = self.views, self.screen, self.choice
-        self.views, self.screen, self.choice = Views(some), RayGrid(some, SCREEN_ROWS), RayGrid(some, CHOICE_ROWS)
+        whole = self.views, self.coarse_grid, self.fine_grid
+        self.views, self.coarse_grid, self.fine_grid = Views(some), RayGrid(some, COARSE_ROWS), RayGrid(some, FINE_ROWS)
         try:
             yield [_only(frame, chosen) for frame in frames], [pyramid.of_views(chosen) for pyramid in pyramids]
         finally:
-            self.views, self.screen, self.choice = whole
+            self.views, self.coarse_grid, self.fine_grid = whole
 
     def _adapt(
         self,
@@ -282,25 +284,26 @@ class ContourFinder:
     # --- one frame ----------------------------------------------------------------------------------------------
 
     def pyramid(self, frame: Frame) -> Pyramid:
-        """Return the frame's silhouettes, cleaned, at all scales, and the person's landmarks."""
+        """Return the frame's silhouettes, cleaned, at all scales, and what was measured of the person."""
         pyramid = self.views.pyramid(frame.masks, self.solver.scales, True)
-        return replace(pyramid, landmarks=of_person(frame.landmarks, pyramid.masks[0]))
+        marked = landmarks.of_person(frame.landmarks, pyramid.masks[0])
+        return pyramid if marked is None else replace(pyramid, measured={landmarks.NAME: marked})
 
-    def sighted(self, landmarks: Float) -> RenderedBody | None:
-        """Return the average body on the grid :attr:`choice`, at the pose that a person's landmarks (V, L, 4) show;
+    def sighted(self, seen: Float) -> RenderedBody | None:
+        """Return the average body on the grid :attr:`fine_grid`, at the pose that a person's landmarks (V, L, 4) show;
         None if no two images agree on them."""
-        points = consensus(self.views.rig, landmarks).points
+        points = consensus(self.views.rig, seen).points
         if not np.isfinite(points).any():
             return None
         body = build_cone_body(AVERAGE_BODY)
-        poses = propose(self.views.rig, body, landmarks, np.nanmean(points, axis=0))
-        met = self.choice.render(body, poses[:1])
+        poses = landmarks.propose(self.views.rig, body, seen, np.nanmean(points, axis=0))
+        met = self.fine_grid.render(body, poses[:1])
         return RenderedBody(met.label[0], met.depth[0])
 
     def cues(self, pyramid: Pyramid) -> list[Cue]:
-        """Return what a frame, or each of B frames, shows beside silhouettes: a further cue is listed here."""
-        marked = pyramid.landmarks
-        return [] if marked is None else [LandmarkCue(self.views.rig, self.body, marked)]
+        """Return what a frame, or each of B frames, shows beside silhouettes."""
+        rig, measured = self.views.rig, pyramid.measured
+        return [of(rig, self.body, measured[name]) for name, of in CUES.items() if name in measured]
 
     def contradiction(self, pyramid: Pyramid, poses: Float) -> Float:
         """Return (B, J) variance of the joints' positions, metres², by which the cues contradict poses (B, D)."""
@@ -363,17 +366,17 @@ class ContourFinder:
     def see(self, frame: Frame, images: NDArray[np.uint8] | None = None, pyramid: Pyramid | None = None) -> Seen:
         """Return what a frame shows; ``images`` as in :meth:`settle`, ``pyramid`` that of the frame, if known."""
         pyramid = pyramid or self.pyramid(frame)
-        return Seen(frame, pyramid, self.evidence(self.screen, frame, pyramid), images)
+        return Seen(frame, pyramid, self.evidence(self.coarse_grid, frame, pyramid), images)
 
     def cost(self, pyramid: Pyramid, poses: Float, uncertain: NDArray[np.bool_] | None = None) -> Float:
         """Return (B,) the negative logarithm of the likelihood of a frame without colours, nats."""
-        evidence = Evidence.of(self.screen, pyramid.masks[0], uncertain, cues=self.cues(pyramid))
+        evidence = Evidence.of(self.coarse_grid, pyramid.masks[0], uncertain, cues=self.cues(pyramid))
         return evidence.cost(self.body, poses)
 
     def mean_residual(self, pyramid: Pyramid, poses: Float, uncertain: NDArray[np.bool_] | None = None) -> Float:
         """Return (B,) E_S, mean over the views that see anybody, inf if none does. A body on ``uncertain`` pixels
         counts half."""
-        evidence = Evidence.of(self.screen, pyramid.masks[0], uncertain)
+        evidence = Evidence.of(self.coarse_grid, pyramid.masks[0], uncertain)
         return evidence.mismatch(self.body, poses)
 
     def compared(self, seen: Seen, pose: Float, *proposed: Float) -> tuple[Float, Float]:
@@ -387,7 +390,7 @@ class ContourFinder:
         if len(found):
             found = self.settle(seen.pyramid, found, (0,), seen.images).states
         found = np.concatenate([pose[None], found[skeleton.apart(found, skeleton.joints(pose)) > SAME_POSE_M]])
-        cost = self.evidence(self.choice, seen.frame, seen.pyramid).cost(self.body, found)
+        cost = self.evidence(self.fine_grid, seen.frame, seen.pyramid).cost(self.body, found)
         return found, cost + turning(skeleton, found, pose)
 
     def best(self, seen: Seen, pose: Float, *proposed: Float) -> Float:

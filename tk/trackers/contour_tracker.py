@@ -72,11 +72,11 @@ class ContourTracker(ContourFinder, Stateful[S], ABC):
         return Status.INITIALISED if self._fresh else Status.RECOVERED if cut or self._lost_for else Status.TRACKED
 
     def rendered(self, ahead: bool) -> RenderedBody:
-        """Return the body on the grid :attr:`choice`: at the last pose, or at the one expected in the next frame."""
+        """Return the body on the grid :attr:`fine_grid`: at the last pose, or at the one expected in the next frame."""
         pose, before = self.last_poses()
         if ahead:
             pose = pose + self.contours.prediction * (pose - before)
-        met = self.choice.render(self.body, pose[None])
+        met = self.fine_grid.render(self.body, pose[None])
         return RenderedBody(met.label[0], met.depth[0], self.body.color_group, self.colors.log_likelihood)
 
     def learned(self) -> LearnedColors | None:
@@ -98,8 +98,8 @@ class ContourTracker(ContourFinder, Stateful[S], ABC):
             colors.state = learned
         by_color = 0.0
         if frame.images.size:
-            bins = color_bins(self.choice.sample(frame.images))
-            by_color = colors.likeness(bins[self.choice.sample(frame.masks) >= PERSON])
+            bins = color_bins(self.fine_grid.sample(frame.images))
+            by_color = colors.likeness(bins[self.fine_grid.sample(frame.masks) >= PERSON])
         if pose is None:
             return by_color
         pyramid = self.pyramid(frame)

@@ -200,7 +200,7 @@ def stature_of(finder: ContourFinder, pyramids: Sequence[Pyramid]) -> float:
         except CaptureError:
             continue
         poses = gait.figures(body.skeleton, 4, 0, p_centroid)  # standing, and the Da Vinci pose
-        evidence = Evidence.of(finder.screen, pyramid.masks[0])
+        evidence = Evidence.of(finder.coarse_grid, pyramid.masks[0])
         _, met = evidence.cast(body, poses)
         drawn = met.label > 0 if evidence.others is None else (met.label > 0) & ~evidence.others
         covered = np.count_nonzero(drawn, axis=(2, 3)).mean(axis=0)

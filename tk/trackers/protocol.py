@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # the process that decodes and segments needs no parts of a t
     from tk.model.body.cone_body import ConeBody
     from tk.model.cameras.camera import Rig
     from tk.model.cameras.tracker_frame import TrackerFrame
+    from tk.model.cues.cue import Measured
     from tk.model.cues.part_colors import LearnedColors, RenderedBody
     from tk.model.cues.ray_costs import RayGrid
     from tk.model.hull.hull import HullSurface
@@ -208,16 +209,16 @@ class SharingTracker(Tracker, Protocol):
     """A tracker that does without the pixels of other people, see :class:`Frame`.
 
     Attributes:
-        choice: the grid on which its body is rendered.
-        screen: the coarse grid of :attr:`Estimate.drawn`.
+        fine_grid: the grid on which its body is rendered.
+        coarse_grid: that of :attr:`Estimate.drawn`.
     """
 
-    choice: RayGrid
-    screen: RayGrid
+    fine_grid: RayGrid
+    coarse_grid: RayGrid
 
     def sighted(self, landmarks: Float) -> RenderedBody | None:
-        """Return an average body on the grid :attr:`choice`, at the pose that a person's landmarks (C, L, 4) show; None
-        if no two images agree on them."""
+        """Return an average body on the grid :attr:`fine_grid`, at the pose that a person's landmarks (C, L, 4) show;
+        None if no two images agree on them."""
         ...
 
     def rendered(self, ahead: bool) -> RenderedBody:
@@ -265,19 +266,19 @@ class TwoPassTracker(Tracker, Protocol):
         """Continue at a pose (D,); forget residuals and hypotheses, keep the body and its colours."""
         ...
 
-    def trajectory_cost(self, masks: Sequence[NDArray[np.uint8]], poses: Float, landmarks: Float | None) -> float:
+    def trajectory_cost(self, masks: Sequence[NDArray[np.uint8]], poses: Float, measured: Measured) -> float:
         """Return the negative logarithm of the posterior of poses (N, D), mean over the frames, nats: a body that does
         not fit errs in all of them alike.
 
         Args:
             masks: (C, H, W) of N frames, cleaned.
             poses: (N, D).
-            landmarks: (N, C, L, 4), NaN where they are unknown; None without any.
+            measured: of N frames, see :mod:`tk.model.cues.cue`.
         """
         ...
 
     def headings(
-        self, masks: Sequence[NDArray[np.uint8]], poses: Float, height_m: float | None, landmarks: Float | None
+        self, masks: Sequence[NDArray[np.uint8]], poses: Float, height_m: float | None, measured: Measured
     ) -> tuple[TwoPassTracker, ...]:
         """Return two trackers, whose bodies are fitted to a person with the heading of the poses, and with the opposite
         one; none if the opposite heading is improbable (1e-3). Arguments as for :meth:`cost`, and the subject's height
@@ -295,7 +296,7 @@ class TwoPassTracker(Tracker, Protocol):
         lost: NDArray[np.bool_],
         residual: Float,
         height_m: float | None,
-        landmarks: Float | None = None,
+        measured: Measured | None = None,
         modes: Float | None = None,
         keep_body: bool = False,
         report: Callable[[float], None] = lambda _: None,
@@ -308,7 +309,7 @@ class TwoPassTracker(Tracker, Protocol):
             lost: (F,) bool; such frames are not used and do not change.
             residual: (F, C, 2) of the first pass; NaN where a camera was excluded.
             height_m: the subject's height, if known.
-            landmarks: (F, C, L, 4) of the first pass, NaN where there are none.
+            measured: of F frames, in the first pass; None: nothing.
             modes: (F, 2, D) other poses of the limbs that the first pass left open, as in :class:`Estimate`.
             keep_body: leave the body as it is.
             report: receives the share of the work that is done.

@@ -34,6 +34,8 @@ from tk.model.body.joint_sigma import CHANGING_M, directions, pose_variance, pos
 from tk.model.body.limb_candidates import Limb, turned
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Rig
+from tk.model.cues import landmarks
+from tk.model.cues.cue import Measured, in_frames
 from tk.model.cues.part_colors import LearnedColors, color_bins
 from tk.model.cues.ray_costs import Evidence
 from tk.model.masks.mosaic import doubled
@@ -202,23 +204,23 @@ class RegionTracker(ContourTracker[RegionState]):
         inside = turned(self.world.poses_in(pose[None])[0], self.limbs)
         return np.asarray(self.world.poses_out(inside[None])[0])
 
-    def trajectory_cost(self, masks: Sequence[NDArray[np.uint8]], poses: Float, landmarks: Float | None) -> float:
+    def trajectory_cost(self, masks: Sequence[NDArray[np.uint8]], poses: Float, measured: Measured) -> float:
         """See :class:`~tk.trackers.protocol.TwoPassTracker`."""
         inside = self.world.poses_in(poses)
-        seen = self._pyramids(masks, landmarks)
+        seen = self._pyramids(masks, measured)
         cost = np.mean([self.cost(pyramid, pose[None])[0] for pyramid, pose in zip(seen, inside, strict=True)])
         return float(cost + walking(self.body.skeleton, inside))
 
-    def _pyramids(self, masks: Sequence[NDArray[np.uint8]], landmarks: Float | None) -> list[Pyramid]:
-        """Return the silhouettes and landmarks of frames, arguments as for :meth:`trajectory_cost`."""
-        known = [None] * len(masks) if landmarks is None else [x if np.isfinite(x).any() else None for x in landmarks]
-        return [self.views.pyramid(m, self.solver.scales, False, x) for m, x in zip(masks, known, strict=True)]
+    def _pyramids(self, masks: Sequence[NDArray[np.uint8]], measured: Measured) -> list[Pyramid]:
+        """Return what frames show, arguments as for :meth:`trajectory_cost`."""
+        scales = self.solver.scales
+        return [self.views.pyramid(m, scales, False, in_frames(measured, i)) for i, m in enumerate(masks)]
 
     def headings(
-        self, masks: Sequence[NDArray[np.uint8]], poses: Float, height_m: float | None, landmarks: Float | None
+        self, masks: Sequence[NDArray[np.uint8]], poses: Float, height_m: float | None, measured: Measured
     ) -> tuple[RegionTracker, ...]:
         """See :class:`~tk.trackers.protocol.TwoPassTracker`."""
-        seen, inside = self._pyramids(masks, landmarks), self.world.poses_in(poses)
+        seen, inside = self._pyramids(masks, measured), self.world.poses_in(poses)
         both = np.array([
             self.settle(pyramid, np.stack([pose, turned(pose, self.limbs)])).states
             for pyramid, pose in zip(seen, inside, strict=True)
@@ -235,7 +237,7 @@ class RegionTracker(ContourTracker[RegionState]):
         for tracker, one in zip(trackers, both.swapaxes(0, 1), strict=True):
             fitted = self.fit(seen, one, np.arange(len(seen)), stature, deviation)
             tracker.take_body(fitted.body)
-            costs.append(tracker.trajectory_cost(masks, self.world.poses_out(fitted.poses), landmarks))
+            costs.append(tracker.trajectory_cost(masks, self.world.poses_out(fitted.poses), measured))
         return trackers if costs[1] < costs[0] + DROPPED else ()
 
     def step(self, frame: Frame) -> Estimate:
@@ -317,7 +319,7 @@ class RegionTracker(ContourTracker[RegionState]):
             residual=look.residual,
             masks=pyramid.masks[0],
             drawn=look.label > 0,
-            landmarks=pyramid.landmarks,
+            landmarks=pyramid.measured.get(landmarks.NAME),
         )
 
     def without_foreign(self, frame: Frame) -> Frame:
@@ -327,7 +329,7 @@ class RegionTracker(ContourTracker[RegionState]):
         """
         if not (self.config.colors and self.colors.known and frame.images.size):
             return frame
-        foreign, grid = self.colors.foreign, self.screen
+        foreign, grid = self.colors.foreign, self.coarse_grid
         person = grid.sample(frame.masks) >= PERSON
         unknown = foreign[color_bins(grid.sample(frame.images)[person])]
         view = np.nonzero(person)[0]
@@ -531,7 +533,7 @@ class RegionTracker(ContourTracker[RegionState]):
         lost: NDArray[np.bool_],
         residual: Float,
         height_m: float | None,
-        landmarks: Float | None = None,
+        measured: Measured | None = None,
         modes: Float | None = None,
         keep_body: bool = False,
         report: Callable[[float], None] = lambda _: None,
@@ -539,7 +541,8 @@ class RegionTracker(ContourTracker[RegionState]):
         """See :class:`~tk.trackers.protocol.TwoPassTracker` and :mod:`tk.trackers.second_pass`."""
         if lost.all():
             return poses, residual, np.zeros((len(poses), len(JOINTS)))
-        again = SecondPass(self, masks, landmarks, modes, self.world.poses_in(poses), lost, residual, report)
+        inside = self.world.poses_in(poses)
+        again = SecondPass(self, masks, measured or {}, modes, inside, lost, residual, report)
         if self.contours.adapt and not keep_body:
             again.fit_body(height_m)
         again.settle()

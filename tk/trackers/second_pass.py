@@ -35,6 +35,8 @@ from tk.model.body.joint_sigma import CONSTANT_M, directions, posture_variance
 from tk.model.body.limb_candidates import Limb, exchanged
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.bundle import LONGEST_STEP
+from tk.model.cues import landmarks
+from tk.model.cues.cue import Measured, in_frames
 from tk.model.cues.ray_costs import residual_of
 from tk.model.masks.silhouettes import Pyramid
 from tk.model.motion.coupling import MotionTerm
@@ -91,7 +93,7 @@ class SecondPass:
     Args:
         tracker: with the body and the cameras of this pass.
         masks: (C, H, W) of each frame, cleaned.
-        landmarks: (F, C, L, 4) of each frame, NaN where there are none; None if no frame has any.
+        measured: of F frames, see :mod:`tk.model.cues.cue`.
         modes: (F, 2, D) other poses of the limbs that each frame leaves open; None if they are unknown.
         poses: (F, D) of the first pass.
         lost: (F,) bool; such frames are not used and do not change.
@@ -107,7 +109,7 @@ class SecondPass:
         self,
         tracker: RegionTracker,
         masks: Sequence[NDArray[np.uint8]],
-        landmarks: Float | None,
+        measured: Measured,
         modes: Float | None,
         poses: Float,
         lost: NDArray[np.bool_],
@@ -115,7 +117,7 @@ class SecondPass:
         report: Callable[[float], None],
     ) -> None:
         self.tracker, self._masks, self._report = tracker, masks, report
-        self._landmarks, self._modes = landmarks, modes
+        self._measured, self._modes = measured, modes
         self.tracked = np.flatnonzero(~lost)
         self._share = np.ones(len(poses))
         steps, seen = _steps(tracker.body.skeleton.joints(poses[self.tracked])), len(self.tracked)
@@ -196,8 +198,8 @@ class SecondPass:
     def _judge(self, frames: NDArray[np.int64], covariance: Float) -> None:
         """Set the residuals and the variances of frames, whose poses have covariances (N, D, D)."""
         tracker, seen, poses = self.tracker, self._together(frames), self.poses[frames]
-        label = tracker.screen.render(tracker.body, poses).label
-        sampled = tracker.screen.sample(seen.masks[0]).reshape(label.shape)
+        label = tracker.coarse_grid.render(tracker.body, poses).label
+        sampled = tracker.coarse_grid.sample(seen.masks[0]).reshape(label.shape)
         self.residual[frames] = residual = residual_of(label > 0, sampled >= PERSON, sampled == OTHERS)
         variance = tracker.variance(poses, covariance, residual)
         self._variance[0, frames] = variance + tracker.contradiction(seen, poses)
@@ -229,9 +231,9 @@ class SecondPass:
     def _interpolate(self) -> None:
         """Set angles that only landmarks show between those of the frames in which two images or more have landmarks:
         neither joints nor contours depend on them."""
-        if self._landmarks is None:
+        if (marked := self._measured.get(landmarks.NAME)) is None:
             return
-        images = np.isfinite(self._landmarks[self.tracked]).any(axis=(2, 3)).sum(axis=1)
+        images = np.isfinite(marked[self.tracked]).any(axis=(2, 3)).sum(axis=1)
         seen = self.tracked[images > 1]
         for k in np.flatnonzero(self.tracker.body.skeleton.is_by_landmarks) if len(seen) else ():
             self.poses[self.tracked, k] = np.interp(self.tracked, seen, self.poses[seen, k])
@@ -267,7 +269,7 @@ class SecondPass:
                 if not len(differ):
                     continue
                 pyramid = seen(i)
-                costs = self._costs(pyramid, np.concatenate([present[None], poses[differ]]))
+                costs = self.tracker.cost(pyramid, np.concatenate([present[None], poses[differ]]))
                 more = costs[1:] - costs[0]
                 mean[differ] = np.where(np.isnan(known[differ]), more, known[differ] + RENEWAL * (more - known[differ]))
                 mean[mean > DROPPED] = np.nan
@@ -324,25 +326,11 @@ class SecondPass:
         return Pyramid.of_all([self._pyramid(i) for i in frames], 0)
 
     def _pyramid(self, i: int, scales: int = 1) -> Pyramid:
-        """Return the scales of the masks of frame i, and its landmarks, by the cameras that are used."""
-        landmarks = None
-        if self._landmarks is not None:
-            used = np.isfinite(self.residual[i, :, 0])
-            seen = np.where(used[:, None, None], self._landmarks[i], np.nan)
-            landmarks = seen if np.isfinite(seen).any() else None
-        return self.tracker.views.pyramid(self._seen(i), scales, False, landmarks)
-
-    def _seen(self, i: int) -> NDArray[np.uint8]:
-        """Return the masks (C, H, W) of frame i, empty where a camera is not used."""
-        shown, out = self._masks[int(i)], np.isnan(self.residual[i, :, 0])
-        if out.any():
-            shown = shown.copy()
-            shown[out] = 0
-        return shown
-
-    def _costs(self, pyramid: Pyramid, poses: Float) -> Float:
-        """Return the costs (B,) of poses (B, D) by masks and landmarks, nats."""
-        return self.tracker.cost(pyramid, poses)
+        """Return the scales of the masks of frame i, and what was measured in it, by the cameras that are used."""
+        shown, used = self._masks[int(i)], np.isfinite(self.residual[i, :, 0])
+        if not used.all():
+            shown = np.where(used[:, None, None], shown, np.uint8(0))
+        return self.tracker.views.pyramid(shown, scales, False, in_frames(self._measured, i, used))
 
 
 def second_of_two(cost: Float, steps: Float) -> Float:

@@ -20,6 +20,7 @@ from tk.model.body.body_points import LANDMARKS
 from tk.model.body.cone_body import SHAPE_NUMBERS, build_cone_body
 from tk.model.body.gait_poses import standing_pose, walking_pose
 from tk.model.body.skeleton import JOINTS, SEGMENTS
+from tk.model.cues.landmarks import NAME
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Views
 
@@ -187,8 +188,8 @@ def test_landmarks_show_joints_that_silhouettes_of_straight_limbs_do_not():
     pose[:3] = walk(body, 1)[0, :3]
     (silhouettes,) = pyramids_of(body, pose[None])
     ratio = []
-    for landmarks in (None, landmarks_of(VIEWS.rig, body, pose)):
-        found, _, _ = fit_body(VIEWS, [replace(silhouettes, landmarks=landmarks)], pose[None], SEARCH, STATURE)
+    for measured in ({}, {NAME: landmarks_of(VIEWS.rig, body, pose)}):
+        found, _, _ = fit_body(VIEWS, [replace(silhouettes, measured=measured)], pose[None], SEARCH, STATURE)
         ratio.append(found.dimensions.upper_arm / found.dimensions.forearm)
     true = body.dimensions.upper_arm / body.dimensions.forearm
     # a little, because the landmarks' offsets of some centimetres are unknown

@@ -22,6 +22,7 @@ from tk.kernels.silhouette import Edgels, find_edgels
 from tk.model.body.body_parameters import BodyFamily
 from tk.model.body.skeleton import SEGMENTS, Skeleton
 from tk.model.cameras.camera import Camera, Rig
+from tk.model.cues.landmarks import NAME as MARKED
 from tk.model.cues.landmarks import LandmarkCue
 from tk.model.masks.silhouettes import Pyramid, Views
 from tk.optim.trajectory import Equations
@@ -202,14 +203,14 @@ class ContourBundle:
                 rows = np.hstack([by_pose[i:j], *by_camera, by_body[i:j]])
                 found.add(view.frame, columns, rows, self._information * view.edgels.weight, view.edgels.distance)
         # offsets of landmarks are the same in all frames, so that many frames say as much as one
-        seen = 1.0 / max(sum(frame.pyramid.landmarks is not None for frame in self.frames), 1)
+        seen = 1.0 / max(sum(MARKED in frame.pyramid.measured for frame in self.frames), 1)
         precision = np.full(D, POSE_DEVIATION**-2.0)
         precision[P:] = (self._segment_m or 1.0) ** -2.0
         for f, (frame, pose) in enumerate(zip(self.frames, state.poses, strict=True)):
             difference, excess = np.zeros(D), np.zeros(D)
-            if frame.pyramid.landmarks is not None:
+            if (marked := frame.pyramid.measured.get(MARKED)) is not None:
                 # a network's depth is too cautious, by an unknown share: it says nothing about the body's lengths
-                seen_px = np.where(np.arange(4) < 3, frame.pyramid.landmarks, np.nan)
+                seen_px = np.where(np.arange(4) < 3, marked, np.nan)
                 said = LandmarkCue(state.rig, linear.body, seen_px).rows(pose[None])
                 by_body = self.family.landmark_rows(state.body, pose)
                 hessian, gradient = said.normal_equations(np.concatenate([said.jacobian, by_body[None]], axis=-1))

@@ -1,7 +1,12 @@
-"""A cue: a measurement as a term of the cost, beside the silhouettes."""
+"""A cue: a measurement as a term of the cost, beside the silhouettes.
+
+What was measured of a person in a frame is an array (V, N, K) for each kind of cue, by its name: K numbers of N points
+in V views, NaN where they are unknown. Of F frames the arrays are (F, V, N, K).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -10,6 +15,8 @@ from numpy.typing import NDArray
 from tk.optim.quadratic import Quadratic
 
 Float = NDArray[np.float64]
+Measured = Mapping[str, Float]
+"""What was measured of a person, by the names of the cues; without those of which nothing is known."""
 
 
 class Cue(Protocol):
@@ -33,3 +40,19 @@ class Cue(Protocol):
         """Return (B, J) variance of the joints' positions along an axis, metres², by which the measurement contradicts
         the poses."""
         ...
+
+
+def joined(frames: Sequence[Measured]) -> dict[str, Float]:
+    """Return what was measured in F frames together."""
+    known = {name: values for frame in frames for name, values in frame.items()}
+    return {
+        name: np.array([frame.get(name, np.full(values.shape, np.nan)) for frame in frames])
+        for name, values in known.items()
+    }
+
+
+def in_frames(measured: Measured, rows: int | NDArray[np.int64], used: NDArray[np.bool_] | bool = True) -> Measured:
+    """Return what was measured in a row, or in some rows, of several frames, by the views used, (V,) or (rows, V)."""
+    kept = np.asarray(used)[..., None, None]
+    seen = {name: np.where(kept, values[rows], np.nan) for name, values in measured.items()}
+    return {name: values for name, values in seen.items() if np.isfinite(values).any()}

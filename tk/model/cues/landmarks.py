@@ -37,6 +37,7 @@ from tk.optim.quadratic import Quadratic
 
 Float = NDArray[np.float64]
 
+NAME = "landmarks"  #: of the cue
 # Standard deviation of a landmark in an image, metres along each axis at the person's distance, for a person of average
 # stature: SEEN_M with visibility 1, HIDDEN times as much with visibility 0; and the share of landmarks that are right.
 # Measured on 33 frame sets, three of them of people before markers (1,860 landmarks): at a visibility

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -13,6 +13,7 @@ from tk.kernels.mask_values import OTHERS, PERSON
 from tk.kernels.projection import pack_cameras
 from tk.kernels.silhouette import Silhouettes
 from tk.model.cameras.camera import Rig
+from tk.model.cues.cue import Measured, joined
 from tk.model.masks.regions import clean_by_area
 
 Float = NDArray[np.float64]
@@ -32,36 +33,27 @@ def clean(mask: Masks) -> Masks:
 
 @dataclass(frozen=True)
 class Pyramid:
-    """What the images of a frame show of a person: masks at several scales, a factor of two apart, and landmarks."""
+    """What the images of a frame show of a person: masks at several scales, a factor of two apart, and for the cues."""
 
     # (V, H, W) uint8 for each scale, or (F V, H, W) of F frames; scale 0 is the full image. Pixels of other people are
     # `tk.kernels.mask_values.OTHERS`.
     masks: tuple[Masks, ...]
     sizes: tuple[NDArray[np.int32], ...]  # (V, 2) for each scale, width and height of each camera's image
-    # (V, L, 4), or (F, V, L, 4) of F frames: the person's landmarks, see tk.model.cues.landmarks; None without any
-    landmarks: Float | None = None
+    measured: Measured = field(default_factory=dict)  # of the frame, or of F frames
 
     @staticmethod
     def of_all(frames: Sequence[Pyramid], scale: int) -> Pyramid:
         """Join one scale of several frames; the others are empty."""
         none = np.zeros((0, 0, 0), np.uint8)
-        joined = np.concatenate([frame.masks[scale] for frame in frames])
-        landmarks = all_landmarks([frame.landmarks for frame in frames])
-        return Pyramid((none,) * scale + (joined,), frames[0].sizes[: scale + 1], landmarks)
+        masks = np.concatenate([frame.masks[scale] for frame in frames])
+        measured = joined([frame.measured for frame in frames])
+        return Pyramid((none,) * scale + (masks,), frames[0].sizes[: scale + 1], measured)
 
     def of_views(self, views: NDArray[np.intp]) -> Pyramid:
         """Return the scales of some views."""
-        landmarks = None if self.landmarks is None else self.landmarks[..., views, :, :]
+        measured = {name: values[..., views, :, :] for name, values in self.measured.items()}
         masks, sizes = tuple(level[views] for level in self.masks), tuple(size[views] for size in self.sizes)
-        return Pyramid(masks, sizes, landmarks)
-
-
-def all_landmarks(each: Sequence[Float | None]) -> Float | None:
-    """Return the landmarks of F frames, (V, L, 4) or None each, as (F, V, L, 4); None if no frame has any."""
-    known = [one for one in each if one is not None]
-    if not known:
-        return None
-    return np.array([np.full(known[0].shape, np.nan) if one is None else one for one in each])
+        return Pyramid(masks, sizes, measured)
 
 
 class Views:
@@ -77,10 +69,11 @@ class Views:
         self._cameras32 = self.cameras.astype(np.float32)
         self.sizes = np.array([(c.width, c.height) for c in rig], np.int32)
 
-    def pyramid(self, masks: Masks, scales: int, cleaning: bool, landmarks: Float | None = None) -> Pyramid:
-        """Return the scales of masks (V, H, W), cleaned if ``cleaning``, with landmarks (V, L, 4)."""
+    def pyramid(self, masks: Masks, scales: int, cleaning: bool, measured: Measured | None = None) -> Pyramid:
+        """Return the scales of masks (V, H, W), cleaned if ``cleaning``, and what was measured in the frame."""
+        measured = measured or {}
         if scales == 1 and not cleaning:
-            return Pyramid((masks,), (self.sizes,), landmarks)
+            return Pyramid((masks,), (self.sizes,), measured)
         # everything happens inside boxes around the people
         crops = [(slice(y, y + h), slice(x, x + w)) for x, y, w, h in map(cv2.boundingRect, masks)]
         shared = any((mask[crop] == OTHERS).any() for mask, crop in zip(masks, crops, strict=True))
@@ -98,7 +91,7 @@ class Views:
         for v, crop in enumerate(crops):
             if masks[v][crop].size:
                 _halve([level[v] for level in levels], crop, shared)
-        return Pyramid(tuple(levels), tuple(sizes), landmarks)
+        return Pyramid(tuple(levels), tuple(sizes), measured)
 
     def at(self, pyramid: Pyramid, scale: int) -> Silhouettes:
         """Return a scale of a pyramid, by its index, as the kernels take it."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.cues.landmarks import propose as of_landmarks
+from tk.model.cues import landmarks
 from tk.trackers.proposals.anywhere import centroid
 
 if TYPE_CHECKING:
@@ -23,8 +23,8 @@ def propose(finder: ContourFinder, seen: Seen, pose: Float | None = None) -> Flo
     """Return poses (B, D), the likeliest first: at most :data:`SIGHTED`, or one if there is a present pose (D,); none
     if no landmarks are known."""
     pyramid, rig = seen.pyramid, finder.views.rig
-    if pyramid.landmarks is None:
+    if (marked := pyramid.measured.get(landmarks.NAME)) is None:
         return np.empty((0, len(finder.pose_names)))
     near = centroid(rig, pyramid, seen.frame.index) if pose is None else pose[:3]
-    poses = of_landmarks(rig, finder.body, pyramid.landmarks, near)[: SIGHTED if pose is None else 1]
+    poses = landmarks.propose(rig, finder.body, marked, near)[: SIGHTED if pose is None else 1]
     return finder.settle(pyramid, poses, None, seen.images).states
