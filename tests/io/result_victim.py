@@ -34,6 +34,7 @@ META = ResultMeta(
     reasons=("0: nothing", "1: a loss"),
     judged=True,
     deviation=True,
+    modes=True,
     camera_states=("0: used", "1: torn"),
     segment_names=("torso", "head"),
     feet=True,

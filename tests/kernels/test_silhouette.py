@@ -13,6 +13,7 @@ from tests.model.figures import BODY, draw_silhouettes, scaled, surface_points
 from tests.model.ring import ring_of_cameras
 from tk.errors import ConfigError
 from tk.kernels import silhouette
+from tk.kernels.cone_arrays import PART_MOVED
 from tk.kernels.cones import CONE, ELLIPSOID, END_FAR, END_NEAR, OUTLINE, SIDE_A, SIDE_B, curve_of, enter, point_on
 from tk.kernels.line_search import COLOR_BINS, SearchSettings, search_colors
 from tk.kernels.newton import LENGTHS, NewtonSteps
@@ -203,6 +204,29 @@ def test_equations_are_the_sums_of_the_edgels_rows():
     np.testing.assert_allclose(total.hessian[0], rows.T @ (edgels.weight[:, None] * rows), rtol=1e-9, atol=1e-6)
     np.testing.assert_allclose(total.gradient[0], rows.T @ (edgels.weight * edgels.distance), rtol=1e-9, atol=1e-6)
     assert 0 < total.found[0] <= 1
+
+
+def test_displacements_of_a_segment_in_a_view_are_eliminated():
+    """As with three more unknowns for each segment and view, and a prior on them."""
+    precision = 3e3
+    edgels = edgels_of(BODY, MASKS, POSE, PLAIN)
+    rows, moved = rows_at(POSE, edgels), BODY.arrays.parts[edgels.part, PART_MOVED]
+    hessian, gradient = np.zeros((D, D)), np.zeros(D)
+    for of in {*zip(edgels.view.tolist(), moved.tolist(), strict=True)}:
+        one = (edgels.view == of[0]) & (moved == of[1])
+        both = np.hstack([rows[one], edgels.row[one]])
+        A, y = both.T @ (edgels.weight[one, None] * both), both.T @ (edgels.weight * edgels.distance)[one]
+        gain = A[:D, D:] @ np.linalg.inv(A[D:, D:] + precision * np.eye(3))
+        hessian += A[:D, :D] - gain @ A[D:, :D]
+        gradient += y[:D] - gain @ y[D:]
+    found = equations_of(BODY, MASKS, POSE[None], replace(PLAIN, displacement=precision))
+    np.testing.assert_allclose(found.hessian[0], hessian, rtol=1e-7, atol=1e-5 * np.abs(hessian).max())
+    np.testing.assert_allclose(found.gradient[0], gradient, rtol=1e-7, atol=1e-5 * np.abs(gradient).max())
+    plain = equations_of(BODY, MASKS, POSE[None], PLAIN)
+    firm = equations_of(BODY, MASKS, POSE[None], replace(PLAIN, displacement=1e12))
+    np.testing.assert_allclose(firm.hessian, plain.hessian, rtol=1e-4, atol=1e-5 * np.abs(hessian).max())
+    single = equations_of(BODY, MASKS, POSE[None], replace(PLAIN, displacement=precision), np.float32)
+    np.testing.assert_allclose(single.hessian[0], hessian, rtol=1e-3, atol=1e-3 * np.abs(hessian).max())
 
 
 STEPS = NewtonSteps(

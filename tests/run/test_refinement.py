@@ -294,8 +294,6 @@ def test_frame_that_is_judged_again_has_the_sigma_of_the_first_pass() -> None:
     again, _ = judged(20 * [0.6], sigma=0.2)
     assert np.isnan(again.columns["joints/sigma"]).all() and (again.columns["evidence/sigma"] == 0.2).all()
     assert (again.columns["status"] == Status.SUSPECT).all()
-    both = finish.sigma_of_both(np.array([0.23, 0.03, np.nan]), np.array([0.02, 0.02, 0.0]))
-    np.testing.assert_array_equal(both, [0.23, 0.02, np.nan])
 
 
 def test_person_who_is_tracked_again_by_another_tracker_is_judged_as_in_the_first_pass(

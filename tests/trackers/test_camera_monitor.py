@@ -20,7 +20,7 @@ from tk.io.captures.capture import Capture, open_capture
 from tk.io.results.codec import decode, encode
 from tk.io.results.reader import read_joints
 from tk.io.results.status import Status
-from tk.model.body.joint_sigma import VIEW_M
+from tk.model.body.joint_sigma import CHANGING_M
 from tk.model.cameras.common_view import LEAST_INFORMATION, depth_information
 from tk.model.masks.mask_agreement import Agreement
 from tk.model.setup import Subject
@@ -308,7 +308,7 @@ def test_inconsistent_camera_is_excluded_from_the_opening(scene: Scene) -> None:
         assert not used.masks[2].any() and estimate.status != "lost"
     (line,) = monitor.report()
     assert "camera cam3 disagrees" in line and f"frames 0 to {FRAMES - 1}" in line
-    assert isinstance(monitor.tracker, RegionTracker) and monitor.tracker.view_m == VIEW_M
+    assert isinstance(monitor.tracker, RegionTracker) and monitor.tracker.view_m == CHANGING_M
 
 
 def test_camera_that_is_black_in_a_part_of_the_opening_stays_in_the_other_part(scene: Scene) -> None:

@@ -463,6 +463,45 @@ def test_sigma_is_large_if_two_poses_have_similar_costs() -> None:
     assert (sigma(np.array([half, half, half]), hanging) < 0.05).all()
 
 
+def test_modes_of_the_first_pass_add_to_sigma_and_change_no_pose() -> None:
+    """The masks show an arm at both of its places in all frames; the first pass has chosen one, and kept the other."""
+    hanging = np.repeat(POSES[:1], 3, axis=0)
+    raised = with_arm(POSES[0], "l", (0.1, 1.0, 0.3), 15.0)
+    half = draw_silhouettes(BODY, RIG, np.array([POSES[0], raised])).max(axis=0)
+    tracker, wrist = tracker_at(POSES[0]), JOINTS.index("wrist_l")
+    arm = next(limb for limb in tracker.limbs if "wrist_l" in [JOINTS[k] for k in limb.joints])
+    cheap, dear = np.stack([POSES[0], raised]), np.array([2.0, 0.5])
+    modes = np.full((3, limbs.KEPT, len(raised)), np.nan)
+    modes[1] = limbs.others(POSES[0], POSES[0], [limbs.Modes(arm, cheap, dear)])
+    np.testing.assert_array_equal(modes[1, 0, arm.dofs], raised[arm.dofs])
+    assert np.isnan(modes[1, 1]).all(), "the present pose is no other one"
+
+    def solved(modes: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        masks, lost = np.stack(3 * [half]), np.zeros(3, bool)
+        poses, _, sigma = tracker.second_pass(
+            masks, hanging, lost, np.zeros((3, 3, 2)), None, modes=modes, keep_body=True
+        )
+        return poses, sigma[:, wrist]
+
+    (alone, before), (poses, sigma) = solved(None), solved(modes)
+    np.testing.assert_array_equal(poses, alone)
+    assert (sigma > 0.08).all() and (before < 0.06).all()
+
+
+def test_a_person_who_stands_still_does_not_become_more_certain() -> None:
+    """A second at 15 Hz, and two: the same images are no further evidence."""
+
+    def sigma(frames: int) -> float:
+        tracker, masks = tracker_at(POSES[0]), np.repeat(MASKS[:1], frames, axis=0)
+        poses = np.repeat(POSES[:1], frames, axis=0)
+        none = np.zeros(frames, bool)
+        found = tracker.second_pass(masks, poses, none, np.zeros((frames, 3, 2)), None, keep_body=True)[2]
+        return float(np.median(found[frames // 2]))
+
+    one = sigma(1)
+    assert 0.7 * one < sigma(8) < 1.3 * one
+
+
 def test_second_pass_finds_legs_that_were_exchanged_in_most_frames() -> None:
     tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=1 / 3))
     legs = pairs(tracker.limbs)[1]

@@ -34,7 +34,7 @@ from tk.model.body.body_fit import STATURE_DEVIATION
 from tk.model.body.joint_sigma import CONSTANT_M, directions, posture_variance
 from tk.model.body.limb_candidates import Limb, exchanged
 from tk.model.body.skeleton import JOINTS
-from tk.model.cameras.bundle import LONGEST_STEP
+from tk.model.cameras.bundle import LONGEST_STEP, SEGMENT_M
 from tk.model.cues import landmarks
 from tk.model.cues.cue import Measured, in_frames
 from tk.model.cues.ray_costs import residual_of
@@ -63,7 +63,7 @@ LEVEL = 1
 # Clothes, shadows and the shapes of the model err alike as long as the pose is the same. So the likelihood of a frame
 # counts by the share of CORRELATED_M, metres, that the fastest joint moves in it, and at least by its share of STILL_S,
 # seconds: a person who stands still is seen once, not once a frame.
-CORRELATED_M, STILL_S = 0.33, 1.0
+CORRELATED_M, STILL_S = 0.2, 1.0
 # The negative logarithm of a step's probability is its length divided by STEP_M. In frames with pixels of other people
 # another pose costs SHARED nats more, because the masks do not show the colours by which the first pass has chosen.
 STEP_M, SHARED = SAME_POSE_M, 1.0
@@ -124,9 +124,10 @@ class SecondPass:
         self._share[self.tracked] = np.clip(steps / CORRELATED_M, 1.0 / min(tracker.fps * STILL_S, seen), 1.0)
         self.poses, self.residual = poses.copy(), np.array(residual)
         self._variance = np.zeros((2, len(poses), len(JOINTS)))  # of the pose, and of the choice between two
-        self._body_variance: Float = np.zeros(len(JOINTS))
-        # few frames do not tell the constant part of the displacement from an error
-        self._view_m = float(np.hypot(tracker.view_m, CONSTANT_M if len(self.tracked) <= FIT_FRAMES else 0.0))
+        # in a recording they are constant offsets, which sigma leaves out; few frames do not tell them from errors
+        self._few = seen <= FIT_FRAMES
+        self._constant = np.full(len(JOINTS), SEGMENT_M**2 if self._few else 0.0)
+        self._view_m = float(np.hypot(tracker.view_m, CONSTANT_M)) if self._few else tracker.view_m
         self._done = 0
 
     @property
@@ -135,7 +136,7 @@ class SecondPass:
         skeleton, tracked = self.tracker.body.skeleton, self.tracked
         variance = self._variance.sum(axis=0)
         posture = np.median(directions(skeleton, self.poses[tracked]), axis=0)
-        variance[tracked] += posture_variance(skeleton, self.poses[tracked], posture) + self._body_variance
+        variance[tracked] += posture_variance(skeleton, self.poses[tracked], posture) + self._constant
         return np.sqrt(variance)
 
     def fit_body(self, height_m: float | None) -> None:
@@ -149,9 +150,8 @@ class SecondPass:
         seen = [self._pyramid(i) for i in chosen]
         fitted = tracker.fit(seen, self.poses[chosen], np.arange(len(chosen)), stature, deviation)
         tracker.take_body(fitted.body)
-        # in a recording it is a constant offset, which sigma leaves out; few frames do not tell it from an error
-        if len(tracked) <= FIT_FRAMES:
-            self._body_variance = fitted.variance() / len(tracked)
+        if self._few:
+            self._constant += fitted.variance() / len(tracked)
 
     def settle(self) -> None:
         """Optimise every frame by itself, near its pose of the first pass."""
@@ -205,28 +205,38 @@ class SecondPass:
         self._variance[0, frames] = variance + tracker.contradiction(seen, poses)
 
     def decide(self) -> None:
-        """Track other poses of the limbs in both directions, and replace the present ones where these are likelier."""
-        skeleton, frames = self.tracker.body.skeleton, self.tracked
+        """Track other poses of the limbs in both directions, and replace the present ones where these are likelier;
+        then those that the first pass left open."""
         arms = [Alternative(limb.dofs, limb) for limb in self.tracker.limbs if limb.name.startswith("arm")]
         rest = np.setdiff1d(np.arange(self.poses.shape[1]), np.concatenate([arm.dofs for arm in arms]))
         legs = tuple(limb for limb in self.tracker.limbs if limb.name.startswith("leg"))
         every = np.arange(self.poses.shape[1])
         alternatives = [Alternative(every), Alternative(rest, legs=legs), *arms]
-        if self._modes is not None:
-            rows = range(self._modes.shape[1])
-            alternatives += [Alternative(limb.dofs, limb, mode=k) for limb in self.tracker.limbs for k in rows]
         for step in (1, -1):
             for one, poses, cost in zip(alternatives, *self._track(alternatives, step), strict=True):
-                other = self.poses.copy()
-                other[:, one.dofs] = poses[:, one.dofs]
-                joints = skeleton.joints(np.array([self.poses[frames], other[frames]]))
-                steps = np.linalg.norm(joints[:, None, :-1] - joints[None, :, 1:], axis=-1).max(axis=-1)
-                steps[:, :, np.diff(frames) > 1] = 0.0  # anything may happen in lost frames
-                share = second_of_two(cost[frames], steps / STEP_M)
-                apart = ((joints[1] - joints[0]) ** 2).sum(axis=-1) / 3
-                self._variance[1, frames] += (share * (1.0 - share))[:, None] * apart
-                if one.mode is None:
-                    self.poses[frames[share > 0.5]] = other[frames[share > 0.5]]
+                other, likelier = self._compared(one, poses, cost)
+                self.poses[likelier] = other[likelier]
+        if self._modes is not None:
+            rows = range(self._modes.shape[1])
+            modes = [Alternative(limb.dofs, limb, mode=k) for limb in self.tracker.limbs for k in rows]
+            (ahead, cost), (back, cost_back) = (self._track(modes, step) for step in (1, -1))
+            found = (ahead != self.poses).any(axis=-1)
+            cost = np.where(found, cost, cost_back)
+            for one, poses, of_frames in zip(modes, np.where(found[..., None], ahead, back), cost, strict=True):
+                self._compared(one, poses, of_frames)
+
+    def _compared(self, one: Alternative, poses: Float, cost: Float) -> tuple[Float, NDArray[np.int64]]:
+        """Return the present poses (F, D) with an alternative's limbs, from its poses (F, D), and the frames in which
+        they are likelier, by its cost (F,); add the spread of the two to the variance."""
+        skeleton, frames, other = self.tracker.body.skeleton, self.tracked, self.poses.copy()
+        other[:, one.dofs] = poses[:, one.dofs]
+        joints = skeleton.joints(np.array([self.poses[frames], other[frames]]))
+        steps = np.linalg.norm(joints[:, None, :-1] - joints[None, :, 1:], axis=-1).max(axis=-1)
+        steps[:, :, np.diff(frames) > 1] = 0.0  # anything may happen in lost frames
+        share = second_of_two(cost[frames], steps / STEP_M)
+        apart = ((joints[1] - joints[0]) ** 2).sum(axis=-1) / 3
+        self._variance[1, frames] += (share * (1.0 - share))[:, None] * apart
+        return other, frames[share > 0.5]
 
     def _interpolate(self) -> None:
         """Set angles that only landmarks show between those of the frames in which two images or more have landmarks:
@@ -317,9 +327,11 @@ class SecondPass:
         return result
 
     def _advance(self, frames: int) -> None:
-        """Report the share that is done: every frame is settled once, tracked twice and smoothed in all rounds."""
+        """Report the share that is done: every frame is settled once, tracked twice and smoothed in all rounds; where
+        there are modes, it is tracked twice more."""
         self._done += frames
-        self._report(min(self._done / ((3 + ROUNDS) * len(self.tracked)), 1.0))
+        rounds = 3 + ROUNDS + (0 if self._modes is None else 2)
+        self._report(min(self._done / (rounds * len(self.tracked)), 1.0))
 
     def _together(self, frames: NDArray[np.int64]) -> Pyramid:
         """Return the finest scale of some frames."""

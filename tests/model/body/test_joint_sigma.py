@@ -1,4 +1,4 @@
-"""Standard deviations of joints: from the curvature, and from how far the posture is from the usual one."""
+"""Standard deviations of joints: from the pose's covariance, and from how far the posture is from the mean one."""
 
 from __future__ import annotations
 
@@ -6,16 +6,7 @@ import numpy as np
 import pytest
 
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.joint_sigma import (
-    BENT_M,
-    OFFSET_M,
-    REACH_M,
-    VIEW_M,
-    contour_variance,
-    directions,
-    posture_variance,
-    view_variance,
-)  # fmt: skip
+from tk.model.body.joint_sigma import BENT_M, OFFSET_M, directions, pose_variance, posture_variance
 from tk.model.body.skeleton import JOINTS, build_skeleton
 
 SKELETON = build_skeleton(BodyDimensions.from_stature(1.75))
@@ -26,7 +17,7 @@ def poses(count: int, spread: float = 0.3) -> np.ndarray:
     return np.random.default_rng(3).normal(scale=spread, size=(count, len(NAMES)))
 
 
-def test_contour_variance_equals_that_of_sampled_poses() -> None:
+def test_pose_variance_equals_that_of_sampled_poses() -> None:
     rng = np.random.default_rng(1)
     pose = poses(1)[0]
     D = len(pose)
@@ -34,7 +25,7 @@ def test_contour_variance_equals_that_of_sampled_poses() -> None:
     precision = (root @ root.T + np.eye(D)) * 1e6  # deviations of about a thousandth: joints move as the pose does
     drawn = pose + rng.multivariate_normal(np.zeros(D), np.linalg.inv(precision), 4000)
     moved = SKELETON.joints(drawn) - SKELETON.joints(pose)
-    found = contour_variance(SKELETON, pose, np.linalg.inv(precision))
+    found = pose_variance(SKELETON, pose, np.linalg.inv(precision))
     np.testing.assert_allclose(found, (moved**2).mean(axis=(0, 2)), rtol=0.1)
 
 
@@ -42,8 +33,8 @@ def test_batched_variances_equal_single_ones() -> None:
     D = len(NAMES)
     root = np.random.default_rng(4).normal(size=(6, D, D))
     covariance = root @ root.swapaxes(1, 2) + np.eye(D)
-    many = contour_variance(SKELETON, poses(6).reshape(2, 3, D), covariance.reshape(2, 3, D, D))
-    each = [contour_variance(SKELETON, pose, C) for pose, C in zip(poses(6), covariance, strict=True)]
+    many = pose_variance(SKELETON, poses(6).reshape(2, 3, D), covariance.reshape(2, 3, D, D))
+    each = [pose_variance(SKELETON, pose, C) for pose, C in zip(poses(6), covariance, strict=True)]
     np.testing.assert_allclose(many.reshape(6, -1), each, rtol=1e-9)
 
 
@@ -86,37 +77,3 @@ def test_batches_equal_single_poses(shape: tuple[int, ...]) -> None:
     assert whole.shape == (*shape, len(JOINTS))
     for at in np.ndindex(shape):
         np.testing.assert_allclose(whole[at], posture_variance(SKELETON, batch[at], usual), rtol=0, atol=1e-15)
-
-
-def rays(*headings_deg: float) -> np.ndarray:
-    """(V, 15, 3) horizontal rays to all joints."""
-    angles = np.radians(headings_deg)
-    one = np.stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))], axis=-1)
-    return np.repeat(one[:, None], 15, axis=1)
-
-
-def test_views_around_the_person_add_no_variance_and_facing_views_much() -> None:
-    ring = view_variance(rays(0, 72, 144, 216, 288), np.ones((5, 15)))
-    assert not ring.any()
-    right, facing = (np.sqrt(view_variance(rays(0, angle), np.ones((2, 15)))) for angle in (90, 172))
-    assert (right < VIEW_M).all() and (facing > 4 * VIEW_M).all()
-
-
-def test_joint_that_no_view_shows_is_as_uncertain_as_a_bone_is_long() -> None:
-    shares = np.ones((3, 15))
-    shares[:, 5] = 0.0
-    variance = view_variance(rays(0, 120, 240), shares)
-    assert variance[5] == pytest.approx(REACH_M**2, rel=0.01) and (np.delete(variance, 5) < VIEW_M**2).all()
-
-
-def test_joint_without_a_finite_position_has_no_variance() -> None:
-    seen = rays(0, 90)
-    seen[:, 3] = np.nan
-    assert np.flatnonzero(np.isnan(view_variance(seen, np.ones((2, 15))))).tolist() == [3]
-
-
-def test_variance_grows_with_the_loss_of_a_view() -> None:
-    shares = np.ones((3, 15))
-    before = view_variance(rays(0, 60, 160), shares)
-    shares[1] = 0.0
-    assert (view_variance(rays(0, 60, 160), shares) > 4 * before).all()
