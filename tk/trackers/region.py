@@ -71,8 +71,6 @@ Float = NDArray[np.float64]
 # Frames over which the mean posture is a plain mean; then the oldest are forgotten.
 _POSTURE_FRAMES = 200
 
-# Scales of a frame, at least: from the finest alone Gauss-Newton does not converge.
-FEWEST = 2
 # Rate up to which a frame has all iterations, Hz. With one over-relaxed iteration a scale at 15 Hz, no mean error of
 # walk, dance, fold and cube changes by 0.03 cm, but colours locate a hidden forearm less exactly from two views.
 FULL_HZ = 15.0
@@ -367,8 +365,8 @@ class RegionTracker(ContourTracker[RegionState]):
         """Return the scales of the next frame, coarse to fine, and the iterations at each.
 
         A coarse scale reaches far, but also other limbs' edges. So the first is the finest that reaches as far as a
-        joint may be from its prediction: its last step times the unpredicted share. After a jump, a loss or a high
-        residual it is the coarsest. If the finest scale reaches so far, a frame continues where the last one ended:
+        joint may be from its prediction: its last step times the unpredicted share; from the finest of all alone
+        Gauss-Newton does not converge. After a jump, a loss or a high residual it is the coarsest. If the finest scale reaches so far, a frame continues where the last one ended:
         at higher rates than :data:`FULL_HZ` it has fewer iterations, so that their number a second is the same.
         """
         contours, skeleton, solver = self.contours, self.body.skeleton, self.solver
@@ -377,7 +375,7 @@ class RegionTracker(ContourTracker[RegionState]):
             step_m = max(skeleton.apart(h.pose, skeleton.joints(h.previous)) for h in self._alive)
             error_m = abs(1 - contours.prediction) * step_m
             error_px = error_m * self.views.rig.pixels_per_metre(skeleton.joints(self._best.pose)[0])
-            while first > FEWEST - 1 and window_px * 2 ** (first - 1) >= error_px:
+            while first > self.search_level and window_px * 2 ** (first - 1) >= error_px:
                 first -= 1
             if error_px <= window_px:
                 fewer = max(round(solver.iterations * min(FULL_HZ / self.fps, 1.0)), 1)
