@@ -314,7 +314,6 @@ class ContourFinder:
         images: NDArray[np.uint8] | None = None,
         prior: Quadratic | None = None,
         limb: Limb | None = None,
-        solver: GaussNewtonSettings | None = None,
     ) -> BatchSolution:
         """Minimise by Gauss-Newton from poses (B, D), all in one frame or each in its own.
 
@@ -325,7 +324,6 @@ class ContourFinder:
             images: with images, colour differences attract contours inside the silhouette, too.
             prior: of the poses, in the units of the contours' equations, see :data:`INFORMATION`.
             limb: only this limb moves.
-            solver: iterations at each scale; None: :attr:`solver`.
         """
         body = self.body
         arrays, free = (limb.arrays, limb.dofs) if limb else (body.arrays, None)
@@ -338,7 +336,7 @@ class ContourFinder:
             free,
             body.skeleton.lower,
             body.skeleton.upper,
-            solver or self.solver,
+            self.solver,
             self.terms(pyramid, prior),
             levels,
         )

@@ -42,7 +42,6 @@ from tk.model.masks.regions import SQUARE3
 from tk.model.masks.silhouettes import Pyramid
 from tk.model.reduced_images import crop
 from tk.model.setup import Setup, Subject
-from tk.optim.gauss_newton import GaussNewtonSettings
 from tk.optim.quadratic import Quadratic
 from tk.settings import RegionSettings, Settings, SilhouetteSettings
 from tk.trackers.contour_finder import INFORMATION, Seen
@@ -71,12 +70,6 @@ Float = NDArray[np.float64]
 # Frames over which the mean posture is a plain mean; then the oldest are forgotten.
 _POSTURE_FRAMES = 200
 
-# Rate up to which a frame has all iterations, Hz. With one over-relaxed iteration a scale at 15 Hz, no mean error of
-# walk, dance, fold and cube changes by 0.03 cm, but colours locate a hidden forearm less exactly from two views.
-FULL_HZ = 15.0
-# Share of the finest scale's reach within which a single iteration a scale is a plain one. With 1 instead of 0.25 the
-# limbs of fold and cube, with a single iteration at 15 Hz, are 0.08 cm worse.
-PLAIN = 0.25
 # Standard deviations of the priors about the predicted pose (tk.model.body.joints has those about zero). Chosen on the
 # development captures; half and twice the value change the mean errors of dance and cube (50 frames) by 0.04 cm at
 # most (angle) and 0.01 cm (translation).
@@ -247,10 +240,8 @@ class RegionTracker(ContourTracker[RegionState]):
         # predict, settle
         self._alive += [replace(h, previous=h.pose, jumped=False) for h in self._alive if h.jumped]
         starts = np.array([h.pose + contours.prediction * (h.pose - h.previous) for h in self._alive])
-        levels, solver = self._iterations()
-        poses, hessian, iterations = self.settle(
-            pyramid, starts, levels, seen.images, self.prior(starts), solver=solver
-        )
+        prior = self.prior(starts)
+        poses, hessian, iterations = self.settle(pyramid, starts, self._scales(), seen.images, prior)
         watch.lap("optimise")
         mismatch, met = evidence.cast(self.body, poses)
         if not np.isfinite(mismatch).all():
@@ -361,13 +352,12 @@ class RegionTracker(ContourTracker[RegionState]):
     def last_poses(self) -> tuple[Float, Float]:
         return self._best.pose, self._best.previous
 
-    def _iterations(self) -> tuple[list[int], GaussNewtonSettings]:
-        """Return the scales of the next frame, coarse to fine, and the iterations at each.
+    def _scales(self) -> list[int]:
+        """Return the scales of the next frame, coarse to fine.
 
         A coarse scale reaches far, but also other limbs' edges. So the first is the finest that reaches as far as a
         joint may be from its prediction: its last step times the unpredicted share; from the finest of all alone
-        Gauss-Newton does not converge. After a jump, a loss or a high residual it is the coarsest. If the finest scale reaches so far, a frame continues where the last one ended:
-        at higher rates than :data:`FULL_HZ` it has fewer iterations, so that their number a second is the same.
+        Gauss-Newton does not converge. After a jump, a loss or a high residual it is the coarsest.
         """
         contours, skeleton, solver = self.contours, self.body.skeleton, self.solver
         first, window_px = solver.scales - 1, self.line_search.window_px
@@ -377,11 +367,7 @@ class RegionTracker(ContourTracker[RegionState]):
             error_px = error_m * self.views.rig.pixels_per_metre(skeleton.joints(self._best.pose)[0])
             while first > self.search_level and window_px * 2 ** (first - 1) >= error_px:
                 first -= 1
-            if error_px <= window_px:
-                fewer = max(round(solver.iterations * min(FULL_HZ / self.fps, 1.0)), 1)
-                plain = fewer == 1 and error_px <= PLAIN * window_px
-                solver = replace(solver, iterations=fewer, relaxation=1.0 if plain else solver.relaxation)
-        return list(range(first, -1, -1)), solver
+        return list(range(first, -1, -1))
 
     def prior(self, mean: Float, angle_deg: float = ANGLE_DEG) -> Quadratic:
         """Return the prior: straight joints about zero, all other degrees of freedom about ``mean`` (..., D)."""
