@@ -67,9 +67,6 @@ from tk.trackers.second_pass import STATURE, SecondPass
 
 Float = NDArray[np.float64]
 
-# Frames over which the mean posture is a plain mean; then the oldest are forgotten.
-_POSTURE_FRAMES = 200
-
 # Standard deviations of the priors about the predicted pose (tk.model.body.joints has those about zero). Chosen on the
 # development captures; half and twice the value change the mean errors of dance and cube (50 frames) by 0.04 cm at
 # most (angle) and 0.01 cm (translation).
@@ -455,7 +452,7 @@ class RegionTracker(ContourTracker[RegionState]):
         skeleton = self.body.skeleton
         covariance = np.linalg.inv(INFORMATION * (look.curvature + self.prior(pose).matrix[0]))
         variance = self.variance(pose, covariance, look.label, look.residual)
-        self._postures = min(self._postures + 1, _POSTURE_FRAMES)
+        self._postures += 1
         self._mean_posture += (directions(skeleton, pose) - self._mean_posture) / self._postures
         variance += posture_variance(skeleton, pose, self._mean_posture) + self._spread
         variance += self.contradiction(pyramid, pose[None])[0]
