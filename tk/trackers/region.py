@@ -71,9 +71,6 @@ Float = NDArray[np.float64]
 # development captures; half and twice the value change the mean errors of dance and cube (50 frames) by 0.04 cm at
 # most (angle) and 0.01 cm (translation).
 ANGLE_DEG, TRANSLATION_M = 40.0, 0.3
-# Masks are searched for carried objects if this share of their pixels has colours that are not the person's; objects
-# narrower than six pixels are ignored.
-FOREIGN_SHARE = 0.01
 # A limb is misplaced if the mean mismatch of its rays is larger. In the development captures no limb within 15 cm of
 # the ground truth has 0.25, and most others have 0.3 to 0.4.
 MISPLACED = 0.25
@@ -317,17 +314,14 @@ class RegionTracker(ContourTracker[RegionState]):
         person = grid.sample(frame.masks) >= PERSON
         unknown = foreign[color_bins(grid.sample(frame.images)[person])]
         view = np.nonzero(person)[0]
-        seen, odd = (np.bincount(of, minlength=len(person)) for of in (view, view[unknown]))
-        if odd.sum() < FOREIGN_SHARE * seen.sum():
-            return frame
         masks, uncertain = frame.masks, np.zeros(0, np.bool_)
-        for c in np.flatnonzero(odd >= FOREIGN_SHARE * np.maximum(seen, 1)):
+        for c in np.unique(view[unknown]):
             # one ray more on each side: the mask ends between two rays
             box = tuple(
                 slice(max(rays[0] - 1, 0) * grid.step, (rays[-1] + 2) * grid.step)
                 for rays in (np.flatnonzero(person[c].any(axis=axis)) for axis in (1, 0))
             )
-            # a quarter of the pixels shows objects of this size
+            # a quarter of the pixels shows objects that are wider than six pixels; narrower ones are ignored
             coarse = crop(frame.images[c], masks.shape[1:], *box)[::2, ::2]
             odd_pixels = foreign[color_bins(coarse)] & (masks[c][box][::2, ::2] >= PERSON)
             opened = np.asarray(cv2.morphologyEx(odd_pixels.view(np.uint8), cv2.MORPH_OPEN, SQUARE3), np.uint8)
