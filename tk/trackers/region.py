@@ -48,7 +48,6 @@ from tk.trackers.contour_finder import INFORMATION, Seen
 from tk.trackers.contour_tracker import RECOVER_EVERY, ContourTracker
 from tk.trackers.hypotheses import (
     DROPPED,
-    PATIENCE,
     PROPOSED,
     RENEWAL,
     SAME_POSE_M,
@@ -369,7 +368,7 @@ class RegionTracker(ContourTracker[RegionState]):
         return Quadratic.about(np.where(straight, 0.0, mean), deviation**-2 / INFORMATION)
 
     def _rank(self) -> None:
-        """Sort the hypotheses by cost; drop those that are improbable beside the best, too old or equal."""
+        """Sort the hypotheses by cost; drop those that are improbable beside the best, or equal."""
         if len(self._alive) == 1:
             self._alive = [replace(self._alive[0], age=1)]
             return
@@ -377,7 +376,7 @@ class RegionTracker(ContourTracker[RegionState]):
         kept: list[Hypothesis] = []
         joints: list[Float] = []
         for h in sorted(self._alive, key=lambda h: h.cost):
-            if kept and (h.cost > kept[0].cost + DROPPED or h.age > PATIENCE):
+            if kept and h.cost > kept[0].cost + DROPPED:
                 continue
             if all(skeleton.apart(h.pose, other) > SAME_POSE_M for other in joints):
                 kept.append(h)
