@@ -47,9 +47,6 @@ ANCHORS, CLEAR = 4, 0.2
 EXCHANGE = 6.0
 # A frame in which the residual is higher than the anchor's by this factor triggers a limb search.
 WORSE = 1.2
-# A pose with a higher residual explains nothing: twice what an average body of the right stature leaves. Without a
-# better one in any of the frames the person is not found.
-EXPLAINS_NOTHING = 0.6
 # Alternatives that are followed through the opening, the likeliest of each anchor first: where nothing fits, each takes
 # seconds. Half and twice as many change no mean error of dance and cube (50 frames).
 FOLLOWED = 8
@@ -84,7 +81,7 @@ def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None 
                 raise
             continue
         least = min(least, residual)
-        if residual > EXPLAINS_NOTHING:
+        if residual > finder.contours.lost_error:
             continue
         turned = np.cos(poses[:, skeleton.index("torso_yaw")] - poses[0, skeleton.index("torso_yaw")]) < 0
         for rank, pose in enumerate(poses[1:]):
