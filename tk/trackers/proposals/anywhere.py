@@ -24,9 +24,6 @@ HEADINGS, PHASES = 8, 8
 # Of the poses that the coarsest scale gives, one in REFINED goes on to the finer ones; FINALISTS of those that differ
 # are proposed.
 REFINED, FINALISTS = 3, 4
-# A mask smaller than this share of the largest one does not show where the person is, because others hide most of the
-# person. A view from above, or from twice as far, shows a quarter.
-WHOLE = 0.1
 
 
 def propose(finder: ContourFinder, seen: Seen, pose: Float | None = None) -> Float:
@@ -58,17 +55,18 @@ def propose(finder: ContourFinder, seen: Seen, pose: Float | None = None) -> Flo
 def centroid(rig: Rig, pyramid: Pyramid, index: int) -> Float:
     """Return (3,) the point nearest to the rays through the silhouettes' centroids, metres; ``index``: the frame's.
 
+    A silhouette counts by its area, because a small part of a person does not show where the person is.
+
     Raises:
         CaptureError: fewer than two cameras see anybody.
     """
     A, y, count = np.zeros((3, 3)), np.zeros(3), 0
     shown = [np.nonzero(mask >= PERSON) for mask in pyramid.masks[0]]
-    least = WHOLE * max(len(ys) for ys, _ in shown)
     for (ys, xs), camera in zip(shown, rig, strict=True):
-        if len(ys) <= least:
+        if not len(ys):
             continue
         ray = camera.rays([[xs.mean(), ys.mean()]])[0]
-        across = np.eye(3) - np.outer(ray, ray)
+        across = len(ys) * (np.eye(3) - np.outer(ray, ray))
         A += across
         y += across @ camera.center
         count += 1
