@@ -40,13 +40,11 @@ from tk.model.masks.image_health import IMAGE_FAULTS
 from tk.model.stateful import Stateful
 from tk.trackers.protocol import Estimate, Tracker, sharing
 from tk.trackers.reason import Reason, is_lost
-from tk.trackers.residual import LEVEL, OUTLIER, RATE, RECENT, displacement, level_spread
+from tk.trackers.residual import LEVEL, LEVEL_SPREAD, OUTLIER, RATE, RECENT, displacement
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-# Keeps the logarithm finite where a body fits perfectly; a hundredth of the level.
-_TINY = 1e-3
 # Sigma is unknown after this many consecutive frames with a high residual, and two failed searches for the person.
 UNKNOWN_AFTER = 6
 # Highest speed of the trunk, m/s: a sprinter reaches 12; and an error of its position between frames, metres.
@@ -336,13 +334,13 @@ def _contradicted(residual: Float, false_alarm: float) -> Bool:
     Half of the logarithm's variance lies between recordings, so all frames of a recording with a high level would count
     as contradicted. The limit is therefore set for the probability ``false_alarm`` squared.
     """
-    log = np.log(displacement(residual) + _TINY)
-    measured = np.flatnonzero(np.isfinite(log))
+    away = displacement(residual)
+    measured = np.flatnonzero(np.isfinite(away))
     result = np.zeros(len(residual), np.bool_)
     if len(measured):
         window = min(RECENT, len(measured))
-        mean = np.convolve(log[measured], np.full(window, 1.0 / window), "valid")
-        limit = np.log(LEVEL) - level_spread(window) * NormalDist().inv_cdf(false_alarm**2)
+        mean = np.convolve(away[measured], np.full(window, 1.0 / window), "valid")
+        limit = LEVEL * np.exp(-LEVEL_SPREAD * NormalDist().inv_cdf(false_alarm**2))
         for first in np.flatnonzero(mean > limit):
             result[measured[first : first + window]] = True
     return result

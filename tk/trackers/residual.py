@@ -33,17 +33,9 @@ RATE = 0.05
 # that a torn mask in one of three or more views makes no frame's residual high. In 2 % of the frames of the development
 # captures a view has a larger excess.
 OUTLIER = 5.0
-# Displacement in the mean over the views: mean in correct recordings, standard deviation of its logarithm in one frame
-# and over RECENT frames (0.20 of it lies between recordings), and this number of frames. Measured on walk, dance, fold,
-# cube, treadmill-slow, rig9, hd and sixteen with all, three and two cameras, in 2600 frames less than 6 cm off: 0.065
-# to 0.126 in the median of a recording, at most 0.20 over RECENT frames. Another recording's calibration gives 0.25 to
-# 0.6; two of five cameras turned by 3 degrees give 0.15 to 0.6.
-LEVEL, LEVEL_SPREADS, RECENT = 0.091, (0.30, 0.264), 5
-
-
-def level_spread(frames: int) -> float:
-    """Return the standard deviation of the logarithm of the displacement, mean over 1 to :data:`RECENT` frames."""
-    return float(np.interp(frames, (1, RECENT), LEVEL_SPREADS))
+# Displacement in the mean over the views: mean in correct recordings, standard deviation of its logarithm (most of it
+# lies between recordings), and the frames that are judged together.
+LEVEL, LEVEL_SPREAD, RECENT = 0.091, 0.28, 5
 
 
 def displacements(residual: Float) -> Float:
