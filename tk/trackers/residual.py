@@ -21,10 +21,8 @@ from tk.model.stateful import Stateful
 
 Float = NDArray[np.float64]
 
-# Spread of a residual in a view at the start, and the least that is assumed: absolute, and as a share of the mean.
-# Measured over all views of walk, dance, fold, cube and treadmill-slow: 0.02 to 0.042, median 0.028; 0.2 to 0.5 of the
-# mean.
-START_SPREAD, LEAST_SPREAD, LEAST_SHARE = 0.03, 0.02, 0.2
+# Spread of a residual in a view at the start, and the least that is assumed: median of recordings, share of the person.
+LEAST_SPREAD = 0.028
 # Share of mean and spread that a frame replaces: they follow a change of light or clothes within about 20 frames. The
 # mean of the first frames is a plain mean. With half and twice the value the mean errors of dance and cube (60 frames)
 # change by 0.06 cm at most.
@@ -87,7 +85,7 @@ class ResidualBaseline(Stateful[BaselineState]):
 
     def __init__(self, views: int, false_alarm: float) -> None:
         self.threshold = NormalDist().inv_cdf(1.0 - false_alarm)
-        self.mean, self.spread = np.full((views, 2), np.nan), np.full(views, START_SPREAD)
+        self.mean, self.spread = np.full((views, 2), np.nan), np.full(views, LEAST_SPREAD)
         self._frames = np.zeros(views, np.int64)  # without a high residual, by view
 
     def excess(self, error: Float) -> Float:
@@ -140,8 +138,7 @@ class ResidualBaseline(Stateful[BaselineState]):
         self._frames = self._frames + right
         mean = mean + rate[:, None] * deviation
         # a high residual is no sample of what is normal; it would widen the spread until it counts as normal itself.
-        # 1.25: the mean absolute deviation of a normal variable is 0.8 standard deviations
-        spread = self.spread + RATE * (1.25 * np.abs(np.minimum(rise, self.spread)) - self.spread)
-        least = np.maximum(LEAST_SPREAD, LEAST_SHARE * mean.sum(axis=1))
+        # the mean absolute deviation of a normal variable is √(2/π) standard deviations
+        spread = self.spread + RATE * (np.sqrt(np.pi / 2) * np.abs(np.minimum(rise, self.spread)) - self.spread)
         self.mean = np.where(seen[:, None], mean, self.mean)
-        self.spread = np.where(right, np.maximum(spread, least), self.spread)
+        self.spread = np.where(right, np.maximum(spread, LEAST_SPREAD), self.spread)
