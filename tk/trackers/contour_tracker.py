@@ -23,8 +23,6 @@ from tk.trackers.protocol import Estimate, Frame
 Float = NDArray[np.float64]
 S = TypeVar("S")
 
-# As long as a person stays lost, the search from the centroid of the silhouettes runs once in so many frames.
-RECOVER_EVERY = 3
 # Probability that a ray contradicts the person's own body: the residual (E_S) of the development captures.
 WRONG = 0.1
 

@@ -45,8 +45,10 @@ from tk.trackers.residual import LEVEL, LEVEL_SPREAD, OUTLIER, RATE, RECENT, dis
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-# Sigma is unknown after this many consecutive frames with a high residual, and two failed searches for the person.
-UNKNOWN_AFTER = 6
+# Frames between two searches for a lost person; a residual that stays high starts searches after 1, 2, 4 … times as many.
+RECOVER_EVERY = 3
+# Sigma is unknown after this many consecutive frames with a high residual: two searches have failed.
+UNKNOWN_AFTER = 2 * RECOVER_EVERY
 # Highest speed of the trunk, m/s: a sprinter reaches 12; and an error of its position between frames, metres.
 FASTEST_M_S, TRUNK_ERROR_M = 12.0, 0.2
 _TRUNK = JOINTS.index("pelvis"), JOINTS.index("neck")
@@ -75,8 +77,6 @@ STATE_MEANINGS = ("0: used", *(f"{value}: {fault.text}" for value, fault in enum
 # are assumed, and so are the shares below. With half and twice of each of _POOR_HZ, _TORN and _PIECE, and with _WHOLE
 # from 0.25 to 0.75, the mean errors of a recording with a carried object change by 0.02 cm, another's not at all.
 _BEGIN_HZ, _END_HZ, _POOR_HZ = 0.0015, 0.2, 0.03
-# Least probability of a state.
-_LEAST = 1e-9
 # Wrong poses a second, whatever the cameras are.
 _LOSE_HZ = 0.3
 # Of the frames with a poor mask: the share in which it misses nothing, and in which it shows nothing else; the share in
@@ -199,7 +199,7 @@ class Cameras(Stateful[Belief]):
 
     def _expected(self) -> Float:
         """Return (C, 3) logarithms of the probabilities of the states, before the frame's masks are seen."""
-        return np.asarray(np.log(np.maximum(self._probability[:, :3] @ self._transition, _LEAST)))
+        return np.asarray(np.log(np.maximum(self._probability[:, :3] @ self._transition, np.finfo(np.float64).tiny)))
 
     def _marginal(self, likelihood: Float, cameras: Bool) -> float:
         """Return the logarithm of the likelihood of cameras (C,) in unknown states, from those (C, 3) of each state."""

@@ -45,7 +45,7 @@ from tk.model.setup import Setup, Subject
 from tk.optim.quadratic import Quadratic
 from tk.settings import RegionSettings, Settings, SilhouetteSettings
 from tk.trackers.contour_finder import INFORMATION, Seen
-from tk.trackers.contour_tracker import RECOVER_EVERY, ContourTracker
+from tk.trackers.contour_tracker import ContourTracker
 from tk.trackers.hypotheses import (
     DROPPED,
     PROPOSED,
@@ -55,7 +55,7 @@ from tk.trackers.hypotheses import (
     disagreement,
     walking,
 )
-from tk.trackers.judgement import Match, depth_known
+from tk.trackers.judgement import RECOVER_EVERY, Match, depth_known
 from tk.trackers.proposals import exchanged, limbs
 from tk.trackers.proposals import landmarks as of_landmarks
 from tk.trackers.proposals import opposite as of_heading
