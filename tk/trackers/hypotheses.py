@@ -19,8 +19,8 @@ DROPPED = float(np.log(1000.0))
 PROPOSED = 16.0
 # Share of a hypothesis's running cost that a frame replaces.
 RENEWAL = 0.4
-# Poses whose joints all differ by less than this, metres, are one; at the start, before the body is fitted.
-SAME_POSE_M, SAME_START_M = 0.05, 0.15
+# Poses whose joints all differ by less than this, metres, are one. (Before they settle: tk.model.body.limb_candidates.)
+SAME_POSE_M = 0.05
 # Prior of a person who moves forwards rather than backwards, nats, and the way, metres, of which the half shows it.
 FORWARDS, WAY_M = 3.0, 0.5
 

@@ -22,11 +22,12 @@ from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import AVERAGE_BODY
 from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.initial_pose import GREATEST_STATURE, LEAST_STATURE
+from tk.model.body.limb_candidates import DISTINCT_M
 from tk.model.body.skeleton import Skeleton
 from tk.model.cues.ray_costs import Evidence
 from tk.model.masks.silhouettes import Pyramid
 from tk.model.setup import AVERAGE_STATURE_M
-from tk.trackers.hypotheses import DROPPED, SAME_START_M, TrajectoryHypothesis, different, walking
+from tk.trackers.hypotheses import DROPPED, TrajectoryHypothesis, different, walking
 from tk.trackers.proposals import anywhere, landmarks, opposite
 from tk.trackers.proposals.anywhere import centroid
 
@@ -109,7 +110,7 @@ def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None 
     for hypothesis in hypotheses:
         joints = skeleton.joints(hypothesis.poses)
         apart = [np.max(skeleton.apart(other.poses, joints)) for other in kept]
-        if hypothesis.cost <= hypotheses[0].cost + DROPPED and all(distance > SAME_START_M for distance in apart):
+        if hypothesis.cost <= hypotheses[0].cost + DROPPED and all(distance > DISTINCT_M for distance in apart):
             kept.append(hypothesis)
     return kept
 
@@ -117,7 +118,7 @@ def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None 
 def _contains(skeleton: Skeleton, hypotheses: Sequence[TrajectoryHypothesis], frame: int, pose: Float) -> bool:
     """Return whether one of the hypotheses has the pose (D,) in a frame."""
     joints = skeleton.joints(pose)
-    return any(skeleton.apart(hypothesis.poses[frame], joints) < SAME_START_M for hypothesis in hypotheses)
+    return any(skeleton.apart(hypothesis.poses[frame], joints) < DISTINCT_M for hypothesis in hypotheses)
 
 
 def _find(finder: ContourFinder, seen: Seen) -> tuple[float, Float]:
@@ -127,12 +128,12 @@ def _find(finder: ContourFinder, seen: Seen) -> tuple[float, Float]:
     found = np.concatenate([anywhere.propose(finder, seen), landmarks.propose(finder, seen)])
     both = [opposite.propose(finder, seen, pose, range(finder.solver.scales)[::-1]) for pose in found[:OPPOSITE]]
     found = np.concatenate([found, *both])
-    found = found[different(skeleton, found, SAME_START_M)]
+    found = found[different(skeleton, found, DISTINCT_M)]
     poses = np.array([_searched(finder, seen, pose) for pose in found])
     cost = seen.evidence.cost(finder.body, poses)
     order = np.argsort(cost, kind="stable")
     kept = poses[order[cost[order] < cost.min() + DROPPED]]
-    kept = kept[different(skeleton, kept, SAME_START_M)]
+    kept = kept[different(skeleton, kept, DISTINCT_M)]
     return float(finder.mean_residual(seen.pyramid, kept[:1], seen.frame.uncertain)[0]), kept
 
 

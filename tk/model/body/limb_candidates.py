@@ -19,8 +19,7 @@ from tk.model.body.skeleton import Skeleton, shoulder_angles
 
 Float = NDArray[np.float64]
 
-# Two poses of a limb are different if a joint's positions differ by more than this, metres. Half
-# and twice the value change the mean errors of dance and cube (50 frames) by 0.01 cm at most.
+# Two poses that have not settled are different if a joint's positions differ by more than this, metres.
 DISTINCT_M = 0.12
 
 # Grids of angles. The upper arm has directions on the sphere about 20° apart, without those through the back or far
