@@ -47,9 +47,7 @@ SEEN_M, HIDDEN, RIGHT_SEEN, RIGHT_HIDDEN = 0.023, 4.0, 0.95, 0.5
 # of 1, and how many times as much at a visibility of 0. Measured on 120 bones of people before markers and 1,960 of
 # rendered people, which agree: shares 0.8 to 0.95 and 0.57; deviations 0.057 and 0.062 above 0.95, 0.10 below 0.5.
 DEPTH_SHARE, DEPTH_M, DEPTH_HIDDEN = (0.9, 0.6), 0.055, 1.8
-# Density of a wrong depth, 1/m: it lies anywhere within a bone's length.
-WRONG_DEPTH = 2.0
-# Density of a wrong landmark, 1/m²: it lies anywhere on a standing person.
+# Density of a wrong landmark, 1/m²: it lies anywhere on a standing person; and of a wrong depth, 1/m.
 WRONG_DENSITY = 2.0
 # The next two are assumed; neither they nor INDEPENDENT have been calibrated by the share of right choices yet.
 # Probability that a network exchanges left and right of one half of the body in an image.
@@ -61,10 +59,9 @@ ELSEWHERE = 0.02
 OFFSET_M = 0.02
 # Least visibility of landmarks whose box is compared with the box of a mask, and least overlap of both boxes.
 LEAST_VISIBLE, LEAST_OVERLAP = 0.2, 0.2
-# A proposal minimises the landmarks' cost with standard deviations that are larger by these factors, one after the
-# other: a pose that is far away is attracted, too. A step changes no angle by more than LONGEST_STEP; angles that the
-# landmarks leave open stay near the figure from which it began, by OPEN_ANGLE, radians.
-WIDENED, LONGEST_STEP, OPEN_ANGLE = (16.0, 16.0, 16.0, 8.0, 8.0, 8.0, 4.0, 4.0, 2.0, 2.0, 1.0, 1.0), 0.6, 3.0
+# A proposal minimises the landmarks' cost with standard deviations that are larger by these factors, three steps each: a
+# pose that is far away is attracted, too. A step changes no angle by more than LONGEST_STEP, radians.
+WIDENED, LONGEST_STEP = (16.0, 8.0, 4.0, 2.0, 1.0), 0.6
 # Weight of the landmarks in the contours' equations: these count the edgels of a segment as independent, but clothes
 # and wrong pieces of a mask displace all of them together. With 10 and 20, four real people have errors of 5.8 and 6.2
 # cm instead of 5.2 on average (docs/experiments.md).
@@ -285,8 +282,8 @@ class LandmarkCue:
         sigma = self._widened * DEPTH_M * self._size * DEPTH_HIDDEN ** (1.0 - visibility)
         r = np.where(known, seen, 0.0) - np.einsum("...vi,...ki->...vk", self._sight, bones)
         inside = right / (np.sqrt(2 * np.pi) * sigma) * np.exp(-0.5 * (r / sigma) ** 2)
-        both = inside + (1.0 - right) * WRONG_DEPTH
-        return np.log(both / WRONG_DEPTH), inside / both, r, np.broadcast_to(sigma, both.shape)
+        both = inside + (1.0 - right) * WRONG_DENSITY
+        return np.log(both / WRONG_DENSITY), inside / both, r, np.broadcast_to(sigma, both.shape)
 
 
 def _with_bones(values: Float) -> Float:
@@ -349,9 +346,9 @@ def propose(rig: Rig, body: ConeBody, seen: Float, p_near: Float) -> Float:
     """
     skeleton = body.skeleton
     start = figures(skeleton, p_near)
-    prior = Quadratic.about(start, np.where(skeleton.prismatic, 1.0, OPEN_ANGLE) ** -2.0)
+    prior = Quadratic.about(start, np.where(skeleton.prismatic, 1.0, np.pi) ** -2.0)
     poses = start
-    for widened in WIDENED:
+    for widened in np.repeat(WIDENED, 3):
         cost = LandmarkCue(rig, body, seen, widened).normal(poses) + prior
         step = np.linalg.solve(cost.matrix, cost.linear[..., None])[..., 0] - poses
         poses = skeleton.clip(poses + np.clip(step, -LONGEST_STEP, LONGEST_STEP))
