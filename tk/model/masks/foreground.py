@@ -61,11 +61,6 @@ _REDUCTION = 2
 # 1 to 3.
 _NOISY = 40.0
 
-# Each further foreground neighbour divides the threshold by 2 to this power. Griesser et al. derive such a term from a
-# Markov random field and choose its weight by hand. Without the term (0) masks change by 0.01 to 0.3 %.
-_NEIGHBOUR_OCTAVES = 0.5
-_ITERATIONS = 3  # updates of the labels with the neighbours' term; with 1 masks change by less than 0.1 %
-
 # Plain difference, in noise variances, below which a pixel is background whatever its neighbours are. Noise alone gives
 # a mean of 0.5 and a 99.9 % quantile of 1.03 (chi-square with 27 degrees of freedom, over 54); the remaining factor is
 # for coding noise, which is correlated within a window. At 1 the surplus area is 4 to 9 % larger.
@@ -290,8 +285,6 @@ class CollinearityForeground:
             light_max=_LIGHT if self._learned else 1.0,
             difference_min=_DIFFERENCE_MIN,
             threshold=self.config.threshold,
-            octaves_per_neighbour=_NEIGHBOUR_OCTAVES,
-            iterations=_ITERATIONS,
         )
         person, doubt = self._decide(mosaic, prior)
         self._outline(images, gains, person, mosaic, masks)
@@ -325,7 +318,7 @@ class CollinearityForeground:
         statistic = self._statistic
         difference, collinearity = statistic.difference, statistic.collinearity
         seen = difference > 0
-        certain = without_penumbrae(statistic.labels.view(np.bool_), difference, collinearity, _PENUMBRA, _CORE)
+        certain = without_penumbrae(statistic.labels, difference, collinearity, _PENUMBRA, _CORE)
         if not self._learned:
             certain |= statistic.bright.view(np.bool_)
         if self._small_unknown is not None and prior is not None:
