@@ -23,34 +23,30 @@ from tk.model.body.skeleton import build_skeleton
 
 Float = NDArray[np.float64]
 
-# Prior standard deviation of a dimension's logarithm about the proportions of the stature. Lengths between joints vary
-# by 4 to 5 % at a given stature (Drillis & Contini 1966); definitions of the shoulder's centre differ by more.
-# Fingers may be bent. Radii vary with girth and clothes; so do the ends of the body and the shoulder's drop, which both
-# sources define loosely. Mean errors of walk and dance (60 frames) change by less than 0.1 cm with radii of half and
-# twice the value and with half the values of the lengths; twice these costs 0.3 cm.
+# Prior standard deviation of the logarithm of a length between joints about the proportions of the stature, and of any
+# other dimension: 4 to 5 % at a given stature (Drillis & Contini 1966); girth, clothes, fingers and soles vary more.
+_LENGTH, _OTHER = 0.05, 0.2
 _LENGTHS = (
-    dict.fromkeys(("trunk", "head", "forearm", "thigh", "calf"), 0.05)
-    | dict.fromkeys(("foot", "shoulder_half_width", "hip_half_width"), 0.06)
-    | {"upper_arm": 0.08, "ankle_height": 0.1, "hand": 0.15, "shoulder_drop": 0.25}
-)
-_RADII = 0.2
-
-# Prior standard deviation of a part's shape: logarithms of a, b, m and h about the values that follow from the
-# dimensions, and metres off the bone along x and y at the beginning and at the end of the axis. Parts between joints
-# keep their lengths. Hands, feet and head end a chain, so their lengths and directions are free. Parts in the median
-# plane are symmetric. Half and twice the values of limbs, trunk, head or ends change the mean errors of dance and cube
-# (50 frames) by 0.05 cm at most, those of walk and dance (60 frames, limbs) by less than 0.1 cm.
+    "trunk", "head", "upper_arm", "forearm", "thigh", "calf", "foot", "shoulder_half_width", "hip_half_width"
+)  # fmt: skip
+# Prior standard deviations of a part's shape: of the logarithms of its widths, and of the length of a part that ends a
+# chain, about the values that follow from the dimensions; and of its place off the bone, metres.
+_SHAPE, _OFF_M = 0.15, 0.01
+# Standard deviation of what does not change.
 _FIXED = 1e-6
-_WIDTHS = 3 * (0.15,)
-_LIMB = (*_WIDTHS, _FIXED, *4 * (0.005,))
-_TRUNK = (*_WIDTHS, _FIXED, *2 * (0.01, _FIXED))
-_END = (*_WIDTHS, 0.1, 0.005, 0.005, 0.02, 0.01)
-_HEAD = (*_WIDTHS, 0.1, 0.005, _FIXED, 0.02, _FIXED)
-_SHAPES = {"hand_": _END, "foot_": _END, "head": _HEAD}
 
 # Difference of a dimension's logarithm for its derivative: curvature then changes the derivative by 1e-6, float64's
 # rounding by less.
 _STEP = 1e-6
+
+
+def _shape_deviation(group: str) -> list[float]:
+    """Return the prior standard deviations of a, b, m and h of a group of parts, and of its place along x and y at the
+    beginning and at the end of its axis. Parts between joints keep their lengths; parts in the median plane stay there.
+    """
+    ends = group == "head" or group.startswith(("hand", "foot"))
+    sideways = _OFF_M if group.endswith("_") else _FIXED
+    return [_SHAPE, _SHAPE, _SHAPE, _SHAPE if ends else _FIXED, *2 * (_OFF_M, sideways)]
 
 
 class BodyFamily:
@@ -67,9 +63,9 @@ class BodyFamily:
     def __init__(self, average: BodyDimensions, stature_deviation: float) -> None:
         self.average, self.stature_deviation = average, stature_deviation
         self.groups = build_cone_body(average).shape_groups
-        shapes = [_SHAPES.get(name, _LIMB if name.endswith("_") else _TRUNK) for name in self.groups]
+        shapes = [_shape_deviation(name) for name in self.groups]
         self.mean = np.concatenate([np.log(average.values), np.zeros(SHAPE_NUMBERS * len(self.groups))])
-        self.deviation = np.concatenate([[_LENGTHS.get(name, _RADII) for name in DIMENSIONS], np.ravel(shapes)])
+        self.deviation = np.concatenate([[_LENGTH if name in _LENGTHS else _OTHER for name in DIMENSIONS], np.ravel(shapes)])
         self.start = self.mean.copy()
 
     @staticmethod
