@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.line_search import COLOR_BINS, MOST_LOG_RATIO, Regions
+from tk.kernels.line_search import COLOR_BINS, Regions
 from tk.model.body.cone_body import COLOR_GROUPS, ConeBody
 from tk.model.stateful import Stateful
 
@@ -31,6 +31,8 @@ _SMOOTHING = 0.7
 _ANYTHING = 0.02
 # Share of the histograms that a frame replaces: they follow a change of light within about 20 frames.
 _RATE = 0.05
+# Logarithm of the largest likelihood ratio that one pixel may give. Half and twice: 0.02 cm at most.
+_MOST_LOG_RATIO = 5.0
 # Weight of a contour between two parts of different colours, relative to a silhouette's edge. 0.35: 0.05 cm worse.
 _CONTOUR_WEIGHT = 0.5
 
@@ -106,7 +108,7 @@ class PartColors(Stateful[LearnedColors]):
         share = rows / np.maximum(total, 1e-9)
         log_likelihood = np.log(((1 - _ANYTHING) * share + _ANYTHING / COLOR_BINS).astype(np.float32))
         self.log_likelihood = log_likelihood
-        deficit = (log_likelihood.max(axis=0) - log_likelihood[:-1]) / MOST_LOG_RATIO
+        deficit = (log_likelihood.max(axis=0) - log_likelihood[:-1]) / _MOST_LOG_RATIO
         self.mismatch = np.ascontiguousarray(np.minimum(deficit, 1.0).T)
         self.foreign = outside + _ANYTHING * total[-1] / COLOR_BINS > rows[-1]
 
