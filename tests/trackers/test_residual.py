@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from tk.trackers.residual import (
+    LEAST_SPREAD,
     LEVEL,
     OUTLIER,
-    LEAST_SPREAD,
     ResidualBaseline,
     variance_factor,
 )  # fmt: skip

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ConfigError
 from tk.kernels.mask_values import OTHERS, PERSON
+from tk.model.body.body_fit import INFORMATIVE_FRAMES
 from tk.model.cues.part_colors import RenderedBody
 from tk.model.cues.ray_costs import RayGrid
 from tk.model.masks.image_health import contradiction, sampled
@@ -42,10 +43,6 @@ _LOG = logging.getLogger(__name__)
 
 # Seconds between two searches for people who enter.
 LOOK_EVERY_S = 0.5
-# Frames of the opening in which other people are searched for if the person in the first frame cannot be tracked.
-_TESTED = 4
-# Frames of somebody who enters to which the body is fitted: half a second at 15 Hz.
-_HISTORY = 8
 # After each refusal of somebody who enters the next attempt is twice as far away, up to this multiple of LOOK_EVERY_S:
 # a start takes seconds. The first attempt often fails, because the person is still partly out of view.
 _LONGEST_PAUSE = 8
@@ -89,7 +86,7 @@ class People:
         self._tracked: list[Person] = []
         self._contacts = Contacts()
         self._every = max(1, round(LOOK_EVERY_S * setup.fps))
-        self._unknown: deque[Frame] = deque(maxlen=_HISTORY)  # people who are unknown, in the last frames
+        self._unknown: deque[Frame] = deque(maxlen=INFORMATIVE_FRAMES)  # people who are unknown, in the last frames
         self._refused = 0  # consecutive people who could not be tracked
         self._admit_from = 0  # the frame from which on another may be
         # numbers, as `tk inspect` prints them, of the people who have had a tracker; None before the first frame
@@ -235,7 +232,7 @@ class People:
 
     def _several_in(self, opening: Sequence[Frame]) -> bool:
         """Return whether several people are found in some frame of the opening."""
-        return any(len(self._finder.find(f.masks, f.uncertain)) > 1 for f in spread_over(opening, _TESTED))
+        return any(len(self._finder.find(f.masks, f.uncertain)) > 1 for f in spread_over(opening))
 
     def _shares(self, people: Sequence[LocatedPerson], frames: Sequence[Frame]) -> list[list[Frame]]:
         """Return the observations of each person in consecutive frames, from the hulls in the first one."""
@@ -304,7 +301,7 @@ class People:
                 member.absent = False  # no newcomer is written: who appears may be this person, and the tracker looks
         if frame.index % self._every == 0 and not numbered:  # who is not written, and lost, comes back as a newcomer
             self._tracked = [m for m in self._tracked if m.written or not m.lost]
-        if any(m.lost and not m.absent for m in self._tracked) or len(self._unknown) < _HISTORY:
+        if any(m.lost and not m.absent for m in self._tracked) or len(self._unknown) < INFORMATIVE_FRAMES:
             return {}
         if frame.index < self._admit_from:
             return {}

@@ -65,7 +65,9 @@ class BodyFamily:
         self.groups = build_cone_body(average).shape_groups
         shapes = [_shape_deviation(name) for name in self.groups]
         self.mean = np.concatenate([np.log(average.values), np.zeros(SHAPE_NUMBERS * len(self.groups))])
-        self.deviation = np.concatenate([[_LENGTH if name in _LENGTHS else _OTHER for name in DIMENSIONS], np.ravel(shapes)])
+        self.deviation = np.concatenate(
+            [[_LENGTH if name in _LENGTHS else _OTHER for name in DIMENSIONS], np.ravel(shapes)]
+        )
         self.start = self.mean.copy()
 
     @staticmethod
