@@ -68,7 +68,8 @@ def refine_capture(
     done = refine_rig([person], world.rig, how)
     if done is None:
         raise CaptureError(
-            f"{result}: has too few consecutive tracked frames to refine {capture.path}; {INFORMATIVE_FRAMES} are needed"
+            f"{result}: has too few consecutive tracked frames to refine {capture.path}; "
+            f"{INFORMATIVE_FRAMES} are needed"
         )
     read = np.array(capture.late_frames) / capture.fps
     # what is new is added to the file's delays: those of the capture may include distances from its clock's frames

@@ -320,7 +320,7 @@ class ContourFinder:
             poses: (B, D).
             levels: scales, 0 the finest; None: all.
             images: with images, colour differences attract contours inside the silhouette, too.
-            prior: of the poses, in the units of the contours' equations, see :data:`~tk.model.cameras.bundle.INFORMATION`.
+            prior: of the poses, in units of :data:`~tk.model.cameras.bundle.INFORMATION`.
             limb: only this limb moves.
         """
         body = self.body

@@ -59,8 +59,8 @@ ELSEWHERE = 0.02
 OFFSET_M = 0.02
 # Least visibility of landmarks whose box is compared with the box of a mask, and least overlap of both boxes.
 LEAST_VISIBLE, LEAST_OVERLAP = 0.2, 0.2
-# A proposal minimises the landmarks' cost with standard deviations that are larger by these factors, three steps each: a
-# pose that is far away is attracted, too. A step changes no angle by more than LONGEST_STEP, radians.
+# Factors of the standard deviations with which a proposal minimises the landmarks' cost, three steps each: a pose that is
+# far away is attracted, too. Largest change of an angle in a step, radians.
 WIDENED, LONGEST_STEP = (16.0, 8.0, 4.0, 2.0, 1.0), 0.6
 # Weight of the landmarks in the contours' equations: these count the edgels of a segment as independent, but clothes
 # and wrong pieces of a mask displace all of them together. With 10 and 20, four real people have errors of 5.8 and 6.2
