@@ -126,7 +126,7 @@ class _Shape(NamedTuple):
 
 
 def assign(
-    rig: Rig, grid: RayGrid, bodies: Sequence[RenderedBody | None], frame: Frame, unknown: float = UNKNOWN
+    rig: Rig, grid: RayGrid, bodies: Sequence[RenderedBody | None], frame: Frame
 ) -> PixelOwners:
     """Return the owner of each pixel of the masks.
 
@@ -135,12 +135,11 @@ def assign(
         grid: the cells.
         bodies: of each person the body, or the hull, on the grid; None if it is unknown where the person is.
         frame: images and masks. Pixels with values below 128 have no owner.
-        unknown: see :data:`UNKNOWN`.
     """
     shown = grid.sample(frame.masks) >= PERSON
     owner = np.full(frame.masks.shape, NOBODY, np.int8)
     areas = [np.count_nonzero(body.label, axis=(1, 2)) for body in bodies if body is not None]
-    least = unknown * float(np.median(areas)) if areas else 0.0
+    least = UNKNOWN * float(np.median(areas)) if areas else 0.0
     claims = _claims(grid, frame, bodies, shown)
     colored = frame.images.size > 0 and any(body is not None and body.log_likelihood is not None for body in bodies)
     for v, camera in enumerate(rig):
