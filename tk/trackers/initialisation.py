@@ -51,9 +51,6 @@ WORSE = 1.2
 # Alternatives that are followed through the opening, the likeliest of each anchor first: where nothing fits, each takes
 # seconds. Half and twice as many change no mean error of dance and cube (50 frames).
 FOLLOWED = 8
-# A search that finds a better pose is repeated, at most this often.
-_SEARCHES = 2
-
 
 def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None = None) -> list[TrajectoryHypothesis]:
     """Return trajectory hypotheses over F consecutive frames, best first. Those after the first are nearly as probable;
@@ -68,7 +65,7 @@ def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None 
         CaptureError: fewer than two cameras see anybody in the first frame, or no pose explains what they see.
     """
     if pose is not None:
-        return _follow(finder, seen, _searched(finder, seen[0], pose)[None], 0)
+        return _follow(finder, seen, finder.improved(seen[0], pose)[None], 0)
     skeleton = finder.body.skeleton
     hypotheses: list[TrajectoryHypothesis] = []
     alternatives: list[tuple[int, int, Float, float]] = []  # rank in its anchor, anchor, pose, prior in nats
@@ -129,7 +126,7 @@ def _find(finder: ContourFinder, seen: Seen) -> tuple[float, Float]:
     both = [opposite.propose(finder, seen, pose, range(finder.solver.scales)[::-1]) for pose in found[:OPPOSITE]]
     found = np.concatenate([found, *both])
     found = found[different(skeleton, found, DISTINCT_M)]
-    poses = np.array([_searched(finder, seen, pose) for pose in found])
+    poses = np.array([finder.improved(seen, pose) for pose in found])
     cost = seen.evidence.cost(finder.body, poses)
     order = np.argsort(cost, kind="stable")
     kept = poses[order[cost[order] < cost.min() + DROPPED]]
@@ -172,16 +169,6 @@ def _follow(
             costs[:, i] = seen[i].evidence.cost(finder.body, now)
     means = np.nanmean(costs, axis=1) + walking(skeleton, poses)
     return [TrajectoryHypothesis(one, float(mean)) for one, mean in zip(poses, means, strict=True)]
-
-
-def _searched(finder: ContourFinder, seen: Seen, pose: Float) -> Float:
-    """Return the pose (D,) after limb searches, repeated as long as a search finds a better pose."""
-    for _ in range(_SEARCHES):
-        found = finder.improved(seen, pose)
-        if np.array_equal(found, pose):
-            break
-        pose = found
-    return pose
 
 
 def stature_of(finder: ContourFinder, pyramids: Sequence[Pyramid]) -> float:
