@@ -46,8 +46,6 @@ ANCHORS, CLEAR = 4, 0.2
 # a walk equally well but for noise: the prior of a hypothesis that faces the same way as the best one in its frame is
 # e^-EXCHANGE.
 EXCHANGE = 6.0
-# A frame in which the residual is higher than the anchor's by this factor triggers a limb search.
-WORSE = 1.2
 # Alternatives that are followed through the opening, the likeliest of each anchor first: where nothing fits, each takes
 # seconds. Half and twice as many change no mean error of dance and cube (50 frames).
 FOLLOWED = 8
@@ -142,12 +140,7 @@ def _follow(
         return []
     F, skeleton = len(seen), finder.body.skeleton
     poses = np.tile(np.array(starts)[:, None], (1, F, 1))
-    residuals, costs = np.full((2, len(starts), F), np.nan)
-
-    def residual_of(i: int, poses: Float) -> Float:
-        return finder.mean_residual(seen[i].pyramid, poses, seen[i].frame.uncertain)
-
-    residuals[:, anchor] = residual_of(anchor, poses[:, anchor])
+    costs = np.full((len(starts), F), np.nan)
     costs[:, anchor] = seen[anchor].evidence.cost(finder.body, poses[:, anchor])
     every = finder.search_frames
     for step, end in ((1, F), (-1, -1)):
@@ -155,18 +148,16 @@ def _follow(
             last = poses[:, i - step]
             before = poses[:, i - 2 * step] if abs(i - anchor) > 1 else poses[:, anchor]
             now = finder.settle(seen[i].pyramid, last + finder.contours.prediction * (last - before)).states
-            residual = residual_of(i, now)
-            if not np.isfinite(residual).any():  # no camera sees anybody
+            cost = seen[i].evidence.cost(finder.body, now)
+            if not np.isfinite(cost).any():  # no camera sees anybody
                 poses[:, i] = last
                 continue
-            high = residual > WORSE * residuals[:, anchor]
             means = np.nanmean(costs, axis=1)  # no search brings back a trajectory that is worse by far
-            searched = (high | (abs(i - anchor) % every == 0)) & (means <= means.min() + DROPPED) if every else []
+            searched = (abs(i - anchor) % every == 0) & (means <= means.min() + DROPPED) if every else []
             for b in np.flatnonzero(searched):
                 now[b] = finder.improved(seen[i], now[b])
-                residual[b] = residual_of(i, now[b : b + 1])[0]
-            poses[:, i], residuals[:, i] = now, residual
-            costs[:, i] = seen[i].evidence.cost(finder.body, now)
+                cost[b] = seen[i].evidence.cost(finder.body, now[b : b + 1])[0]
+            poses[:, i], costs[:, i] = now, cost
     means = np.nanmean(costs, axis=1) + walking(skeleton, poses)
     return [TrajectoryHypothesis(one, float(mean)) for one, mean in zip(poses, means, strict=True)]
 
