@@ -42,10 +42,6 @@ OPPOSITE = 2
 # the development captures an average body of the right stature has 0.15 to 0.31 in the right pose and never less than
 # 0.25 in a wrong one.
 ANCHORS, CLEAR = 4, 0.2
-# An average body errs in all frames alike, so the opening counts as much as one frame. Legs that change places explain
-# a walk equally well but for noise: the prior of a hypothesis that faces the same way as the best one in its frame is
-# e^-EXCHANGE.
-EXCHANGE = 6.0
 # Alternatives that are followed through the opening, the likeliest of each anchor first: where nothing fits, each takes
 # seconds. Half and twice as many change no mean error of dance and cube (50 frames).
 FOLLOWED = 8
@@ -66,8 +62,8 @@ def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None 
         return _follow(finder, seen, finder.improved(seen[0], pose)[None], 0)
     skeleton = finder.body.skeleton
     hypotheses: list[TrajectoryHypothesis] = []
-    alternatives: list[tuple[int, int, Float, float]] = []  # rank in its anchor, anchor, pose, prior in nats
-    clear: list[tuple[int, Float, float]] = []  # anchor, pose, prior
+    alternatives: list[tuple[int, int, Float]] = []  # rank in its anchor, anchor, pose
+    clear: list[tuple[int, Float]] = []  # anchor, pose
     least = np.inf
     for anchor in np.unique(np.linspace(0, len(seen) - 1, ANCHORS).astype(int)):
         try:
@@ -79,13 +75,11 @@ def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None 
         least = min(least, residual)
         if residual > finder.contours.lost_error:
             continue
-        turned = np.cos(poses[:, skeleton.index("torso_yaw")] - poses[0, skeleton.index("torso_yaw")]) < 0
-        for rank, pose in enumerate(poses[1:]):
-            alternatives.append((rank, int(anchor), pose, 0.0 if turned[1 + rank] else EXCHANGE))
+        alternatives += [(rank, int(anchor), pose) for rank, pose in enumerate(poses[1:])]
         if _contains(skeleton, hypotheses, anchor, poses[0]):
             break  # found from two frames
         if residual < CLEAR and not hypotheses:
-            clear = [(int(anchor), poses[0], 0.0)]  # followed with its alternatives: no other anchor is needed
+            clear = [(int(anchor), poses[0])]  # followed with its alternatives: no other anchor is needed
             break
         hypotheses += _follow(finder, seen, poses[:1], anchor)
         if residual < CLEAR:
@@ -97,9 +91,8 @@ def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None 
         )
     likeliest = sorted(range(len(alternatives)), key=lambda i: alternatives[i][0])[:FOLLOWED]
     for anchor, group in groupby([*clear, *(alternatives[i][1:] for i in sorted(likeliest))], itemgetter(0)):
-        new = [(pose, prior) for _, pose, prior in group if not _contains(skeleton, hypotheses, anchor, pose)]
-        followed = _follow(finder, seen, [pose for pose, _ in new], anchor)
-        hypotheses += [one._replace(cost=one.cost + prior) for one, (_, prior) in zip(followed, new, strict=True)]
+        new = [pose for _, pose in group if not _contains(skeleton, hypotheses, anchor, pose)]
+        hypotheses += _follow(finder, seen, new, anchor)
     hypotheses.sort(key=lambda hypothesis: hypothesis.cost)
     kept: list[TrajectoryHypothesis] = []
     for hypothesis in hypotheses:
