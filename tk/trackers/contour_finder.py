@@ -26,7 +26,7 @@ from tk.model.body.initial_pose import rough_pose
 from tk.model.body.limb_candidates import Limb, limbs_of
 from tk.model.body.skeleton import JOINTS, build_skeleton, convert_poses
 from tk.model.body.stored_body import body_values
-from tk.model.cameras.bundle import INFORMATION
+from tk.model.cameras.bundle import CORRELATION_PX
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import spread_out
 from tk.model.cameras.landmark_agreement import consensus
@@ -55,6 +55,8 @@ ESTIMATED_STATURE_DEVIATION = 0.05
 # heights the factor is 0.955 to 1.077 on nine recordings; children's proportions and wide clothes need more. A visual
 # hull that is lower by more than this shows a person who bends, so its height is no estimate of the stature.
 MOST_STATURE_RATIO = 1.35
+# Information of one pixel of contour, 1/px²: edgels err by 2 px. The unit of the contours' equations.
+INFORMATION = 1.0 / (2.0**2 * CORRELATION_PX)
 # Cameras that the search at the start uses, at most. More cost time and hardly add a direction: with 8 of the 16
 # cameras of sixteen the mean error of the joints changes by less than 0.1 cm. The body is fitted with all of them.
 OPENING_CAMERAS = 8
@@ -320,7 +322,7 @@ class ContourFinder:
             poses: (B, D).
             levels: scales, 0 the finest; None: all.
             images: with images, colour differences attract contours inside the silhouette, too.
-            prior: of the poses, in units of :data:`~tk.model.cameras.bundle.INFORMATION`.
+            prior: of the poses, in the units of the contours' equations, see :data:`INFORMATION`.
             limb: only this limb moves.
         """
         body = self.body

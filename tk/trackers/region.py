@@ -33,7 +33,6 @@ from tk.model.body.body_fit import STATURE_DEVIATION
 from tk.model.body.joint_sigma import VIEW_M, contour_variance, directions, posture_variance, view_variance
 from tk.model.body.limb_candidates import Limb, turned
 from tk.model.body.skeleton import JOINTS
-from tk.model.cameras.bundle import INFORMATION
 from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import LearnedColors, color_bins
 from tk.model.cues.ray_costs import Evidence
@@ -45,7 +44,7 @@ from tk.model.reduced_images import crop
 from tk.model.setup import Setup, Subject
 from tk.optim.quadratic import Quadratic
 from tk.settings import RegionSettings, Settings, SilhouetteSettings
-from tk.trackers.contour_finder import Seen
+from tk.trackers.contour_finder import INFORMATION, Seen
 from tk.trackers.contour_tracker import ContourTracker
 from tk.trackers.hypotheses import (
     DROPPED,
