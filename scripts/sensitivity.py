@@ -15,8 +15,8 @@ it change, too. A line a value: mean errors of limbs (constant offsets removed) 
 Then the range of values around the present one in which the means of both over the captures change by less than
 ``--limit`` cm.
 
-``--table`` writes a page with all constants of the package: value, meaning (the comment before the constant), and the
-last column of the page as it was. The ranges just measured replace what the last column says of their constants.
+``--table`` writes a page of the constants that have been measured: value, meaning (the comment before the constant),
+and the last column of the page as it was. The ranges just measured replace what it says of their constants.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ import dataclasses
 import importlib
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -247,16 +248,19 @@ def _line(label: str, value: Any, errors: np.ndarray) -> str:
     return f"  {label:10} {shown(value):>12}   {text}   mean {errors[:, 0].mean():5.2f} {errors[:, 1].mean():5.2f}"
 
 
-# --- the page of all constants ----------------------------------------------------------------------------------------
+# --- the page of measured constants -----------------------------------------------------------------------------------
 
 # Longest value in the page, characters.
 _LONG = 80
 _HEAD = """# Constants
 
-All numbers of the program that no user sets, by module: value, meaning with unit, and what was
-measured with other values. `python -m scripts.sensitivity --table docs/constants.md` writes the
-page; the last column stays as it is, or gets the ranges that the same run measures. Errors are mean
-errors of joints. The recordings are those of the [results](results.md#recordings-and-errors).
+Numbers that no user sets, by module: value, meaning with unit (the comment before the constant),
+and what was measured with other values. Errors are mean errors of joints; the recordings are those
+of the [results](results.md#recordings-and-errors). Constants that are not listed have their source
+in the comment before them, or no result depends on them.
+
+`python -m scripts.sensitivity --table docs/constants.md` writes the page from the sources. The last
+column stays as it is; constants that the same run measures are added with their ranges.
 """
 
 
@@ -314,21 +318,30 @@ def _comment(lines: Sequence[str], node: ast.stmt) -> str:
 
 
 def known_of(text: str) -> dict[str, str]:
-    """Return what the last column of a page says, by constant."""
-    rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| `")]
-    return {row[0].strip("`"): row[-1].strip() for row in rows if len(row) == 4}
+    """Return what the last column of a page says, by module and names."""
+    known, module = {}, ""
+    for line in text.splitlines():
+        cells = re.split(r"(?<!\\)\|", line)
+        if line.startswith("## "):
+            module = line[3:]
+        elif line.startswith("| `") and len(cells) == 6:
+            known[f"{module}:{cells[1].strip(' `')}"] = cells[4].strip().replace("\\|", "|")
+    return known
 
 
 def page(found: Iterable[Constant], known: Mapping[str, str]) -> str:
-    """Return the page of constants; ``known``: what is known of some, by module and names, or by one name."""
+    """Return the page of the constants of which something is ``known``, by module and names, or by one name."""
     parts, module = [_HEAD], ""
     for one in found:
+        keys = one.key, *(f"{one.module}:{name}" for name in one.names)
+        said = [known[key] for key in keys if key in known]
+        if not said:
+            continue
         if one.module != module:
             module = one.module
             parts.append(f"\n## {module}\n\n| constant | value | meaning | measured |\n|---|---|---|---|\n")
-        said = [known[key] for key in (one.key, *(f"{module}:{name}" for name in one.names)) if key in known]
         value = one.value if len(one.value) < _LONG else "table"
-        cells = [f"`{one.key}`", f"`{value}`", one.meaning, said[-1] if said else ""]
+        cells = [f"`{', '.join(one.names)}`", f"`{value}`", one.meaning, said[-1]]
         parts.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n")
     return "".join(parts)
 
@@ -348,7 +361,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--method", default="region", help="as for tk track")
     parser.add_argument("--config", type=Path, help="settings to begin with")
     parser.add_argument("--limit", type=float, default=0.1, help="smallest change that counts, cm")
-    parser.add_argument("--table", type=Path, metavar="FILE", help="write the page of all constants")
+    parser.add_argument("--table", type=Path, metavar="FILE", help="write the page of measured constants")
     args = parser.parse_args(arguments)
     if bool(args.names) != bool(args.captures) or not (args.names or args.table):
         parser.error("NAME and --captures belong together; without them, --table is needed")

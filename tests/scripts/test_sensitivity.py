@@ -132,7 +132,12 @@ def test_page_has_each_constant_with_its_comment_and_keeps_what_was_measured(tmp
     found = list(constants(package))
     assert [one.key for one in found] == ["pkg.module:A, B", "pkg.module:D", "pkg.module:T"]
     assert [one.meaning for one in found][:2] == ["A length, metres: of two lines.", "Behind."]
-    text = page(found, {"pkg.module:A, B": "1 cm", "pkg.module:D": "2 cm"})
-    assert "| `pkg.module:T` | `('a \\| b', 5)` |" in text
+    text = page(found, {"pkg.module:A, B": "1 | 2 cm", "pkg.module:T": "2 cm"})
+    assert "| `T` | `('a \\| b', 5)` |" in text and "`D`" not in text
     assert page(found, known_of(text)) == text
     assert "2 to 4" in page(found, known_of(text) | {"pkg.module:D": "2 to 4"})
+
+
+def test_page_of_the_package_names_constants_that_exist() -> None:
+    known = known_of((sensitivity.PACKAGE.parent / "docs" / "constants.md").read_text(encoding="utf-8"))
+    assert known and set(known) <= {one.key for one in constants(sensitivity.PACKAGE)}

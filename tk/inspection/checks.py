@@ -41,10 +41,8 @@ from tk.trackers.judgement import FAULTS
 
 Masks = NDArray[np.uint8]
 
-# These values decide which findings are printed, and no tracking result depends on them. With half and twice each value
-# the findings on walk, fold, rig9, pair and treadmill-slow are the same, except for specks in the ragged masks of
-# treadmill-slow (half the value names two cameras more, twice the value one fewer).
-#: frames that are compared; frames whose neighbours, REACH before and after, are also compared
+#: frames that are compared; frames whose neighbours, REACH before and after, are also compared. These values decide
+#: which findings are printed, and no tracking result depends on them.
 _FRAMES, _DELAY_FRAMES = 10, 5
 #: frames that are read, from the first one that all cameras have: videos are decoded in order, so later frames take
 #: longer

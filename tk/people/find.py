@@ -41,7 +41,6 @@ _ROWS = 240
 # one view. Half of it, unexplained in a camera, starts a search for others.
 _LEAST_AREA_M2 = 0.3
 # By which the extent of a hull exceeds the height, metres: soles, hair, and what is carved too little below the feet.
-# Mean of eight people of the development captures; after it, heights are wrong by 0.06 at most.
 _EXCESS_M = 0.02
 # People whose feet differ in height by less than this share a floor, metres: jumps are as high.
 _ONE_FLOOR_M = 0.3

@@ -18,9 +18,7 @@ from tk.trackers.protocol import Frame
 
 Float = NDArray[np.float64]
 
-# A hull has people's pixels mixed up if its volume changes by this factor in the opening. With 1.5, one of two people
-# who begin beside each other (pair, frame 30) has a body of three frames; limbs of both are 4.8 and 2.1 cm off, with 2
-# 2.6 and 2.2.
+# A hull has people's pixels mixed up if its volume changes by this factor in the opening.
 _MIXED = 2.0
 
 

@@ -30,7 +30,7 @@ Float = NDArray[np.float64]
 # People are in contact if their pelvises are closer than this, metres: arms reach so far.
 CONTACT_M = 1.0
 # An assignment is clear if its log-likelihood, mean per pixel and summed over both people, exceeds that of the other by
-# this. At the ends of six contacts (pair, a crossing, a handshake, an embrace) the right one exceeds it by 4.2 to 5.7.
+# this.
 CLEAR = 0.3
 
 OPEN, KEPT, EXCHANGED, UNCLEAR = range(4)

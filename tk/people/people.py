@@ -48,8 +48,7 @@ LOOK_EVERY_S = 0.5
 _LONGEST_PAUSE = 8
 # Least share of the area of a person who is tracked that must be unexplained in two views before a search.
 _LEAST_UNEXPLAINED = 0.25
-# Likeness by the colours above which somebody who enters is a person who has left. On pair and a rendered crossing, by
-# colours and body: -0.1 to -0.7 for the same person, -1.6 to -3.7 for the other one.
+# Likeness by the colours above which somebody who enters is a person who has left.
 _SAME_COLORS = -1.1
 
 

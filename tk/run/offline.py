@@ -36,16 +36,12 @@ _LOG = logging.getLogger(__name__)
 Float = NDArray[np.float64]
 Note = Callable[[str], None]
 
-# Frames in which the opposite heading is compared. With 8, 12 and 20, the decisions about five faults of a
-# generated recording, two of them tracked back to front, are right in 5, 5 and 4.
+# Frames in which the opposite heading is compared.
 HEADING_FRAMES = 12
 
 #: entry in `/model` of a result after the second pass
 REFINED = "refined"
-# A joint keeps its sigma of the first pass where that exceeds the sigma of the second pass by this factor. With 1, 5 %
-# more of walk's joints are within one sigma, where 12 % too many are; 4 changes such shares by less than 1 %. Without
-# the rule, joints more than 15 cm off with a sigma below 5 cm rise from 0 to 0.1 % (dance, three cameras) and from 1.0
-# to 1.1 % (walk, two).
+# A joint keeps its sigma of the first pass where that exceeds the sigma of the second pass by this factor.
 _LESS_SURE = 2.0
 
 

@@ -22,8 +22,7 @@ Float = NDArray[np.float64]
 # Frames of a refinement, and of a check of the cameras' agreement, at most.
 FRAMES = 20
 # Refined cameras are used if they reduce the contours' distance to less than this share. One of five cameras turned by
-# the least angle that counts as inconsistent, 0.06° or 0.8 px, reduces a distance of 1.4 px to 0.96 of it. On dance
-# with turned cameras the share is 0.87.
+# the least angle that counts as inconsistent, 0.06° or 0.8 px, reduces a distance of 1.4 px to 0.96 of it.
 _WORTHWHILE = 0.98
 # Largest number of refinements while the whole frames of the videos' delays still change.
 _SHIFTS = 3

@@ -38,13 +38,12 @@ Float = NDArray[np.float64]
 
 # Poses whose opposite heading is proposed, too.
 OPPOSITE = 2
-# Frames of the opening in which the person is searched for, in turn. The search ends at a residual (E_S) of CLEAR: on
-# the development captures an average body of the right stature has 0.15 to 0.31 in the right pose and never less than
-# 0.25 in a wrong one.
+# Frames of the opening in which the person is searched for, in turn, and the residual (E_S) at which the search ends.
 ANCHORS, CLEAR = 4, 0.2
 # Alternatives that are followed through the opening, the likeliest of each anchor first: where nothing fits, each takes
-# seconds. Half and twice as many change no mean error of dance and cube (50 frames).
+# seconds.
 FOLLOWED = 8
+
 
 def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None = None) -> list[TrajectoryHypothesis]:
     """Return trajectory hypotheses over F consecutive frames, best first. Those after the first are nearly as probable;

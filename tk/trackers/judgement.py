@@ -74,8 +74,7 @@ _CERTAIN = np.array([False, *(fault.certain for fault in FAULTS.values())])
 STATE_MEANINGS = ("0: used", *(f"{value}: {fault.text}" for value, fault in enumerate(FAULTS.values(), 1)))
 
 # A camera becomes wrong once in eleven minutes, a mask poor once in half a minute; both last five seconds. These rates
-# are assumed, and so are the shares below. With half and twice of each of _POOR_HZ, _TORN and _PIECE, and with _WHOLE
-# from 0.25 to 0.75, the mean errors of a recording with a carried object change by 0.02 cm, another's not at all.
+# are assumed, and so are the shares below.
 _BEGIN_HZ, _END_HZ, _POOR_HZ = 0.0015, 0.2, 0.03
 # Wrong poses a second, whatever the cameras are.
 _LOSE_HZ = 0.3

@@ -66,20 +66,13 @@ from tk.trackers.second_pass import STATURE, SecondPass
 
 Float = NDArray[np.float64]
 
-# Standard deviations of the priors about the predicted pose (tk.model.body.joints has those about zero). Chosen on the
-# development captures; half and twice the value change the mean errors of dance and cube (50 frames) by 0.04 cm at
-# most (angle) and 0.01 cm (translation).
+# Standard deviations of the priors about the predicted pose (tk.model.body.joints has those about zero).
 ANGLE_DEG, TRANSLATION_M = 40.0, 0.3
-# A limb is misplaced if the mean mismatch of its rays is larger. In the development captures no limb within 15 cm of
-# the ground truth has 0.25, and most others have 0.3 to 0.4.
+# A limb is misplaced if the mean mismatch of its rays is larger.
 MISPLACED = 0.25
 # Limbs are searched for in every second frame if this share of the body's rays meets pixels of other people: a hidden
-# limb has no contour to follow, and appears elsewhere. With 0.1 and 0.2 the limbs of seven people in four rendered
-# scenes are on average 0.3 and 0.4 cm worse; a search in every frame changes the mean of 13 people by 0.1 cm. Where the
-# pose explains the frame as well as others, nothing can be found: the residual must be DOUBTFUL spreads above its
-# mean. 62 of 142 searches in four scenes are below, and 3 of the 21 that changed a limb by more than 0.3 cm. Without a
-# limit, with 0.5 and with 1 the limbs of twelve people are 1.58, 1.57 and 1.54 cm off on average; with 1, those of one
-# of two people who circle each other before four cameras without an empty scene are 0.5 cm worse.
+# limb has no contour to follow, and appears elsewhere. Where the pose explains the frame as well as others, nothing can
+# be found: the residual must be DOUBTFUL spreads above its mean.
 HIDDEN, SEARCH_HIDDEN, DOUBTFUL = 0.02, 2, 0.5
 
 

@@ -24,12 +24,10 @@ Float = NDArray[np.float64]
 # Spread of a residual in a view at the start, and the least that is assumed: median of recordings, share of the person.
 LEAST_SPREAD = 0.028
 # Share of mean and spread that a frame replaces: they follow a change of light or clothes within about 20 frames. The
-# mean of the first frames is a plain mean. With half and twice the value the mean errors of dance and cube (60 frames)
-# change by 0.06 cm at most.
+# mean of the first frames is a plain mean.
 RATE = 0.05
-# An excess above this in one view, in spreads, is an outlier. The mean over the views counts it as this value, so
-# that a torn mask in one of three or more views makes no frame's residual high. In 2 % of the frames of the development
-# captures a view has a larger excess.
+# An excess above this in one view, in spreads, is an outlier. The mean over the views counts it as this value, so that
+# a torn mask in one of three or more views makes no frame's residual high.
 OUTLIER = 5.0
 # Displacement in the mean over the views: mean in correct recordings, standard deviation of its logarithm (most of it
 # lies between recordings), and the frames that are judged together.

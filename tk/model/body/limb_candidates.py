@@ -24,7 +24,6 @@ DISTINCT_M = 0.12
 # Candidates of a limb, spread evenly over the ranges of its angles.
 SPREAD = 1024
 # Gauss-Newton steps of exchanged limbs, and their damping, m²: angles that move joints by less than 3 cm a radian stay.
-# In a walk, half and four times the steps, and half and twice the 3 cm, move exchanged joints by less than 0.1 cm.
 _EXCHANGE_STEPS, _EXCHANGE_DAMPING = 6, 0.03**2
 # Standard deviation of the angles of candidates near the current pose.
 _NEAR_DEG = 25.0

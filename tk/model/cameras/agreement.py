@@ -30,12 +30,9 @@ _SIGMA_OF_TWO = {"shift": 5.0, "focal": 0.05, "offset": 2.0}
 # Half the difference of points for a derivative, metres.
 _STEP_M = 1e-4
 # Cameras disagree if a shift exceeds this angle, degrees, or a delay this part of a frame, and either exceeds this many
-# standard deviations (three: one false alarm in 370). Captures with exact cameras (walk, dance) show 0.02° and 0.01
-# frames; lower limits refine cameras that are right.
+# standard deviations (three: one false alarm in 370).
 INCONSISTENT_DEG, LATE_FRAMES, SIGNIFICANT = 0.06, 0.2, 3.0
 # Two cameras contradict each other if they show the person larger and smaller by more than this share, significantly.
-# 24 pairs of correct cameras of the development captures: at most 0.002. One of them turned by 3°: 0.008 to 0.018 where
-# the start finds no contradiction.
 SIZE = 0.005
 # An edge's weight falls to a quarter at robust_px: less than in the tracker's search, because a camera can do without
 # the edges of folds, shadows and hands.

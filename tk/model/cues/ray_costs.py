@@ -35,7 +35,6 @@ VIEW_NATS = 60.0
 # The mismatch of a view is divided by the number of the person's rays. Where others hide most of the person, the
 # divisor is at least this share of the largest number in any view, so that a hand beside a back counts less than a
 # person.
-# Chosen on pair. With one person (dance and cube, 50 frames) half and twice the value change no mean error.
 LEAST_SEEN = 0.25
 
 

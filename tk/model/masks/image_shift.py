@@ -40,11 +40,9 @@ _TUKEY = 4.685
 _FREE, _LEAST_STILL = 0.5, 0.2
 # Least correlation of registered images; that of unrelated ones is 0.
 _LEAST_CORRELATION = 0.75
-# Least ratio of the images' difference without the shift to that with it. Shifts that noise of 25 grey levels causes on
-# dance give 1.02 to 1.12; a camera that is bumped or sags, from three quarters of a pixel on, gives 3.9 and more.
+# Least ratio of the images' difference without the shift to that with it.
 _LEAST_RATIO = 1.25
-# Largest shift, share of the longer side, of an image that shows another camera's empty scene. Neighbouring cameras of
-# rig9 and hd see each other's scene with a shift of 0.23 and more; exchanged videos have 0.
+# Largest shift, share of the longer side, of an image that shows another camera's empty scene.
 _SAME_PLACE = 0.1
 
 

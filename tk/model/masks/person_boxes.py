@@ -16,10 +16,9 @@ from tk.model.masks.regions import SQUARE3
 _DEVIATIONS = 3.0  # a coarse pixel differs from the scene by this many standard deviations of a reduced pixel's noise
 _WHOLE = 128  # fixed-point value of the share 1 of the scene's light, so that twice the light fits into a byte
 # Side of a cell in coarse pixels. Regions in cells that touch, or are one cell apart, are one region. It sets how far a
-# hand may be from the body. Half and twice the value change nothing on dance and cube (50 frames).
+# hand may be from the body.
 _CELL = 4
-# Regions with a smaller share of the largest region's pixels are ignored. From 0 to 0.1 the masks of seven captures are
-# equal; with 0 the boxes are larger and segmentation slower.
+# Regions with a smaller share of the largest region's pixels are ignored.
 _SHARE = 0.02
 # Margin of a box, share of the image height. In 535 images of five rendered captures a margin of 20 of 240 pixels cuts
 # nothing off; one of 12 pixels cuts a hand off in five of them.

@@ -22,7 +22,6 @@ SQUARE5 = np.ones((5, 5), np.uint8)
 _CROSS3 = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 # Pixels of strong statistic that a part of the person needs, if it is not the largest: more than noise gives by chance.
-# Half and twice the value change no mean error of dance and cube (50 frames).
 _STRONG_PIXELS = 4
 
 

@@ -25,14 +25,12 @@ from tk.model.cameras.camera import Camera
 Float = NDArray[np.float64]
 Masks = NDArray[np.uint8]
 
-# Parts of a mask smaller than this share of the largest one are not the person. Half and twice the
-# value change no mean error of dance and cube (50 frames).
+# Parts of a mask smaller than this share of the largest one are not the person.
 _SPECK_SHARE = 0.1
 # Pixels of a mask's largest part, at least: a smaller one has no shape.
 _LEAST_PIXELS = 20
-# A pair is tested if the line through the centres is farther from the middle of the person than this many of the
-# person's greatest extents, as seen from either camera: half an extent would touch the silhouette. On the development
-# captures correct pairs have the same errors from 0.55 to 1; with 1, three times as many pairs cannot be tested.
+# Two cameras are tested if the line through their centres is farther from the middle of the person than this many of
+# the person's greatest extents, as seen from either camera: half an extent would touch the silhouette.
 _CLEAR_OF_LINE = 0.65
 # A tangent beyond this angle about the line is on its other side: the silhouettes have nothing in common.
 _OPPOSITE = np.pi / 2
