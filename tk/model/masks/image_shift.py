@@ -30,8 +30,6 @@ _SIZE = 96
 _FINE, _COARSE = 1.0, 3.0
 # A camera is looked at in every second frame: a tripod moves for longer.
 _PAUSE = 2
-# Every second pixel of each row and column is compared: the details are wider.
-_EVERY = 2
 # Iterations, and the last step in pixels, after which a registration ends.
 _ITERATIONS, _CONVERGED = 8, 0.02
 # Tukey's constant: 95 % efficiency for normal noise.
@@ -186,7 +184,7 @@ def _register(first: Gray, now: Gray, still: NDArray[np.bool_], shift: Float) ->
         shift: (2,) where to begin.
     """
     h, w = first.shape
-    y, x = (_EVERY * at for at in np.nonzero(still[::_EVERY, ::_EVERY]))
+    y, x = np.nonzero(still)
     gradient = np.stack([cv2.Sobel(first, cv2.CV_32F, dx, 1 - dx, scale=1 / 8)[y, x] for dx in (1, 0)], axis=-1)
     before = np.stack([x, y], axis=-1).astype(np.float64)
     border = np.array([_COARSE, _COARSE])
@@ -203,7 +201,7 @@ def _register(first: Gray, now: Gray, still: NDArray[np.bool_], shift: Float) ->
     correlation, gain = 0.0, np.nan
     for _ in range(_ITERATIONS):
         seen = seen_by_both(shift)
-        if seen.sum() < _LEAST_STILL * h * w / _EVERY**2:
+        if seen.sum() < _LEAST_STILL * h * w:
             return shift, 0.0
         reference, moved = values(seen, shift)
         if np.isnan(gain):
