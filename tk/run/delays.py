@@ -17,10 +17,11 @@ from tk.model.cameras.camera import Rig
 from tk.model.cues.ray_costs import RayGrid, residual_of
 from tk.trackers.contour_finder import SCREEN_ROWS
 
-# Whole frames of a video's delay that are tried before the refinement, whose edges reach some pixels only; and the
-# frames in which they are tried. A delay at the edge of the range is no optimum: the range is then doubled, at most to
-# MOST frames, which takes some seconds.
-REACH, MOST, DELAY_FRAMES = 5, 80, 12
+# Frames of a recording in which delays, headings or runs are compared.
+COMPARED = 12
+# Whole frames of a video's delay that are tried before the refinement, whose edges reach some pixels only. A delay at
+# the edge of the range is no optimum: the range is then doubled, at most to MOST frames, which takes some seconds.
+REACH, MOST = 5, 80
 # A video is late if its share of wrong pixels falls below this factor without the delay.
 _MENDED = 0.8
 # Least share of wrong pixels that is compared, a tenth of what correct cameras have: drawn masks have none.
@@ -43,7 +44,7 @@ def whole_delays(people: Sequence[TrackedPerson], rig: Rig) -> NDArray[np.int64]
     The cameras are in the world of the poses.
     """
     grid = RayGrid(rig, SCREEN_ROWS)
-    shares_of = [_shares_by_delay(person, grid, -(-DELAY_FRAMES // len(people))) for person in people]
+    shares_of = [_shares_by_delay(person, grid, -(-COMPARED // len(people))) for person in people]
     late, unknown, reach = np.zeros(len(rig), np.int64), np.ones(len(rig), np.bool_), REACH
     while unknown.any() and reach <= MOST:
         shares = np.concatenate([of_delays(range(-reach, reach + 1)) for of_delays in shares_of], axis=1)

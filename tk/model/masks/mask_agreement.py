@@ -40,8 +40,6 @@ INCONSISTENT = 0.06
 # One camera is identified as wrong if the share outside falls to this fraction without it. If none is identified, the
 # cameras are refused above this many times INCONSISTENT.
 _LEFT_OVER, _REFUSED = 0.5, 2.0
-# Share of a mask that may stay outside when it is shifted into the hull of the others: what segmented masks leave.
-_OUTSIDE_SHIFTED = 0.03
 # Without a majority, exchanged videos are searched for among at most this many cameras: of more, without two of them,
 # the others are a majority.
 _SWAPS_OF = 8
@@ -352,7 +350,7 @@ class MaskAgreement:
             area += float(mask.sum())
         if area == 0.0:
             return np.full(2, np.nan)
-        shifts = np.argwhere(inside >= (1 - _OUTSIDE_SHIFTED) * area)[:, ::-1] - reach
+        shifts = np.argwhere(inside >= (1 - INCONSISTENT / 2) * area)[:, ::-1] - reach
         if len(shifts) == 0:
             return np.full(2, np.nan)
         return np.asarray(shifts[np.argmin((shifts**2).sum(axis=1))] * float(self.step), np.float64)

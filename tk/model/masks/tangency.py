@@ -21,12 +21,11 @@ from numpy.typing import NDArray
 
 from tk.kernels.mask_values import PERSON
 from tk.model.cameras.camera import Camera
+from tk.model.masks.silhouettes import SPECK_SHARE
 
 Float = NDArray[np.float64]
 Masks = NDArray[np.uint8]
 
-# Parts of a mask smaller than this share of the largest one are not the person.
-_SPECK_SHARE = 0.1
 # Pixels of a mask's largest part, at least: a smaller one has no shape.
 _LEAST_PIXELS = 20
 # Two cameras are tested if the line through their centres is farther from the middle of the person than this many of
@@ -63,7 +62,7 @@ class Outline:
         largest = max(areas, default=0.0)
         if largest < _LEAST_PIXELS:
             return None
-        parts = [contour[:, 0] for contour, area in zip(contours, areas, strict=True) if area >= _SPECK_SHARE * largest]
+        parts = [contour[:, 0] for contour, area in zip(contours, areas, strict=True) if area >= SPECK_SHARE * largest]
         pixels = np.concatenate(parts).astype(np.float64)
         corners = cv2.convexHull(camera.undistort(pixels).astype(np.float32), returnPoints=False)[:, 0]
         last = np.array([camera.width, camera.height]) - 1.0
