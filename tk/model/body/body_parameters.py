@@ -31,7 +31,7 @@ _LENGTHS = (
 )  # fmt: skip
 # Prior standard deviations of a part's shape: of the logarithms of its widths, and of the length of a part that ends a
 # chain, about the values that follow from the dimensions; and of its place off the bone, metres.
-_SHAPE, _OFF_M = 0.15, 0.01
+_SHAPE, _OFF_M = 0.15, 0.005
 # Standard deviation of what does not change.
 _FIXED = 1e-6
 

@@ -56,7 +56,7 @@ ELSEWHERE = 0.02
 OFFSET_M = 0.02
 # Least visibility of landmarks whose box is compared with the box of a mask, and least overlap of both boxes.
 LEAST_VISIBLE, LEAST_OVERLAP = 0.2, 0.2
-# Factors of the standard deviations with which a proposal minimises the landmarks' cost, three steps each: a pose that
+# Factors of the standard deviations with which a proposal minimises the landmarks' cost, two steps each: a pose that
 # is far away is attracted, too. Largest change of an angle in a step, radians.
 WIDENED, LONGEST_STEP = (16.0, 8.0, 4.0, 2.0, 1.0), 0.6
 # Weight of the landmarks in the contours' equations: these count the edgels of a segment as independent, but clothes
@@ -344,7 +344,7 @@ def propose(rig: Rig, body: ConeBody, seen: Float, p_near: Float) -> Float:
     start = figures(skeleton, p_near)
     prior = Quadratic.about(start, np.where(skeleton.prismatic, 1.0, np.pi) ** -2.0)
     poses = start
-    for widened in np.repeat(WIDENED, 3):
+    for widened in np.repeat(WIDENED, 2):
         cost = LandmarkCue(rig, body, seen, widened).normal(poses) + prior
         step = np.linalg.solve(cost.matrix, cost.linear[..., None])[..., 0] - poses
         poses = skeleton.clip(poses + np.clip(step, -LONGEST_STEP, LONGEST_STEP))
