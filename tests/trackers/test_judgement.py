@@ -14,6 +14,7 @@ from tk.io.results.status import Status
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.skeleton import build_skeleton
+from tk.model.cues.part_colors import RATE
 from tk.trackers.judgement import (
     STATES,
     TORN,
@@ -30,7 +31,7 @@ from tk.trackers.judgement import (
 )
 from tk.trackers.protocol import Estimate
 from tk.trackers.reason import CONSEQUENCES, Reason, is_lost, known_sigma, report_frames, status_of
-from tk.trackers.residual import LEVEL, RATE, RECENT, displacement, variance_factor
+from tk.trackers.residual import LEVEL, RECENT, displacement, variance_factor
 
 VIEWS = 4
 

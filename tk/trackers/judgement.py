@@ -36,11 +36,12 @@ from tk.io.results.status import Status
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import determine_depth
+from tk.model.cues.part_colors import RATE
 from tk.model.masks.image_health import IMAGE_FAULTS
 from tk.model.stateful import Stateful
 from tk.trackers.protocol import Estimate, Tracker, sharing
 from tk.trackers.reason import Reason, is_lost
-from tk.trackers.residual import LEVEL, LEVEL_SPREAD, OUTLIER, RATE, RECENT, displacement
+from tk.trackers.residual import LEVEL, LEVEL_SPREAD, OUTLIER, RECENT, displacement
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

@@ -17,15 +17,13 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.model.cues.part_colors import RATE
 from tk.model.stateful import Stateful
 
 Float = NDArray[np.float64]
 
 # Spread of a residual in a view at the start, and the least that is assumed: median of recordings, share of the person.
 LEAST_SPREAD = 0.028
-# Share of mean and spread that a frame replaces: they follow a change of light or clothes within about 20 frames. The
-# mean of the first frames is a plain mean.
-RATE = 0.05
 # An excess above this in one view, in spreads, is an outlier. The mean over the views counts it as this value, so that
 # a torn mask in one of three or more views makes no frame's residual high.
 OUTLIER = 5.0
@@ -122,8 +120,8 @@ class ResidualBaseline(Stateful[BaselineState]):
         return bool(seen.any() and (excess[seen] > OUTLIER).all())
 
     def learn(self, residual: Float) -> None:
-        """Update the baseline with a frame's residual (V, 2). E_S counts as one spread above the mean at most, so that
-        a wrong pose does not become the baseline soon."""
+        """Update the baseline with a frame's residual (V, 2); the mean of the first frames is a plain mean. E_S counts
+        as one spread above the mean at most, so that a wrong pose does not become the baseline soon."""
         error = residual.sum(axis=1)
         seen = np.isfinite(error)
         mean = self._means(residual)

@@ -22,11 +22,13 @@ from tk.optim.trajectory import gauge_projection
 
 Float = NDArray[np.float64]
 
-# Prior standard deviations of a camera's shift, pixels, and delay, frames: wide, so that 20 frames outweigh them.
+# Prior standard deviation of a video's delay, frames.
+OFFSET_FRAMES = 2.0
+# Prior standard deviations of a camera's shift, pixels, and of its delay: wide, so that 20 frames outweigh them.
 # With two cameras, a sideways turn of one looks like another position of the person, and only the person's size
 # contradicts it. So each of two cameras also has an unknown focal length (its logarithm).
-_SIGMA = {"shift": 5.0, "offset": 2.0}
-_SIGMA_OF_TWO = {"shift": 5.0, "focal": 0.05, "offset": 2.0}
+_SIGMA = {"shift": 5.0, "offset": OFFSET_FRAMES}
+_SIGMA_OF_TWO = {"shift": _SIGMA["shift"], "focal": 0.05, "offset": OFFSET_FRAMES}
 # Half the difference of points for a derivative, metres.
 _STEP_M = 1e-4
 # Cameras disagree if a shift exceeds this angle, degrees, or a delay this part of a frame, and either exceeds this many
