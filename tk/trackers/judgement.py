@@ -79,9 +79,8 @@ STATE_MEANINGS = ("0: used", *(f"{value}: {fault.text}" for value, fault in enum
 _BEGIN_HZ, _END_HZ, _POOR_HZ = 0.0015, 0.2, 0.03
 # Wrong poses a second, whatever the cameras are.
 _LOSE_HZ = 0.3
-# Of the frames with a poor mask: the share in which it misses nothing, and in which it shows nothing else; the share in
-# which it misleads. The mean size of a piece, as a share of the person's pixels.
-_WHOLE, _TORN, _PIECE = 0.5, 0.05, 0.15
+# Share of the frames with a poor mask in which it misleads. Mean size of a piece, as a share of the person's pixels.
+_TORN, _PIECE = 0.05, 0.15
 
 
 def likelihoods(excess: Float, spread: Float) -> Float:
@@ -96,7 +95,7 @@ def likelihoods(excess: Float, spread: Float) -> Float:
     normal = -(over**2) / 2 - np.log(2 * np.pi) / 2
     anything = np.log(spread)[:, None]
     pieces = anything - np.log(_PIECE) - over * spread[:, None] / _PIECE
-    poor = np.logaddexp(np.log(_WHOLE) + normal, np.log1p(-_WHOLE) + pieces).sum(axis=1)
+    poor = (np.logaddexp(normal, pieces) - np.log(2.0)).sum(axis=1)  # an area is normal or not, equally likely
     found = np.stack([normal.sum(axis=1), poor, 2 * anything[:, 0]], axis=1)
     return np.where(np.isfinite(excess[:, :1]), found, 0.0)
 

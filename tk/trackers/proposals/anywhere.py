@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError
 from tk.kernels.mask_values import PERSON
 from tk.model.body import gait_poses as gait
+from tk.model.body.initial_pose import HEADINGS
 from tk.model.body.limb_candidates import DISTINCT_M
 from tk.model.cameras.camera import Rig
 from tk.model.masks.silhouettes import Pyramid
@@ -20,8 +21,8 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-# Headings, and walking phases of each, from which the person is searched for.
-HEADINGS, PHASES = 8, 8
+# Walking phases at each heading from which the person is searched for.
+PHASES = 8
 # Of the poses that the coarsest scale gives, one in REFINED goes on to the finer ones; FINALISTS of those that differ
 # are proposed.
 REFINED, FINALISTS = 3, 4
