@@ -29,24 +29,21 @@ _LENGTH, _OTHER = 0.05, 0.2
 _LENGTHS = (
     "trunk", "head", "upper_arm", "forearm", "thigh", "calf", "foot", "shoulder_half_width", "hip_half_width"
 )  # fmt: skip
-# Prior standard deviations of a part's shape: of the logarithms of its widths, and of the length of a part that ends a
-# chain, about the values that follow from the dimensions; and of its place off the bone, metres.
-_SHAPE, _OFF_M = 0.15, 0.005
-# Standard deviation of what does not change.
+# Prior standard deviation of a part's shape: logarithms of a, b, m and h about the values that follow from the
+# dimensions, and metres off the bone along x and y at the beginning and at the end of the axis. Parts between joints
+# keep their lengths. Hands, feet and head end a chain, so their lengths and directions are free. Parts in the median
+# plane are symmetric.
 _FIXED = 1e-6
+_WIDTHS = 3 * (0.15,)
+_LIMB = (*_WIDTHS, _FIXED, *4 * (0.005,))
+_TRUNK = (*_WIDTHS, _FIXED, *2 * (0.01, _FIXED))
+_END = (*_WIDTHS, 0.1, 0.005, 0.005, 0.02, 0.01)
+_HEAD = (*_WIDTHS, 0.1, 0.005, _FIXED, 0.02, _FIXED)
+_SHAPES = {"hand_": _END, "foot_": _END, "head": _HEAD}
 
 # Difference of a dimension's logarithm for its derivative: curvature then changes the derivative by 1e-6, float64's
 # rounding by less.
 _STEP = 1e-6
-
-
-def _shape_deviation(group: str) -> list[float]:
-    """Return the prior standard deviations of a, b, m and h of a group of parts, and of its place along x and y at the
-    beginning and at the end of its axis. Parts between joints keep their lengths; parts in the median plane stay there.
-    """
-    ends = group == "head" or group.startswith(("hand", "foot"))
-    sideways = _OFF_M if group.endswith("_") else _FIXED
-    return [_SHAPE, _SHAPE, _SHAPE, _SHAPE if ends else _FIXED, *2 * (_OFF_M, sideways)]
 
 
 class BodyFamily:
@@ -63,7 +60,7 @@ class BodyFamily:
     def __init__(self, average: BodyDimensions, stature_deviation: float) -> None:
         self.average, self.stature_deviation = average, stature_deviation
         self.groups = build_cone_body(average).shape_groups
-        shapes = [_shape_deviation(name) for name in self.groups]
+        shapes = [_SHAPES.get(name, _LIMB if name.endswith("_") else _TRUNK) for name in self.groups]
         self.mean = np.concatenate([np.log(average.values), np.zeros(SHAPE_NUMBERS * len(self.groups))])
         self.deviation = np.concatenate(
             [[_LENGTH if name in _LENGTHS else _OTHER for name in DIMENSIONS], np.ravel(shapes)]
