@@ -23,12 +23,17 @@ from tk.model.body.skeleton import build_skeleton
 
 Float = NDArray[np.float64]
 
-# Prior standard deviation of the logarithm of a length between joints about the proportions of the stature, and of any
-# other dimension: 4 to 5 % at a given stature (Drillis & Contini 1966); girth, clothes, fingers and soles vary more.
-_LENGTH, _OTHER = 0.05, 0.2
+# Prior standard deviation of a dimension's logarithm about the proportions of the stature. Lengths between joints vary
+# by 4 to 5 % at a given stature (Drillis & Contini 1966); definitions of the shoulder's centre differ by more.
+# Fingers may be bent. Radii vary with girth and clothes; so do the ends of the body and the shoulder's drop, which both
+# sources define loosely.
 _LENGTHS = (
-    "trunk", "head", "upper_arm", "forearm", "thigh", "calf", "foot", "shoulder_half_width", "hip_half_width"
-)  # fmt: skip
+    dict.fromkeys(("trunk", "head", "forearm", "thigh", "calf"), 0.05)
+    | dict.fromkeys(("foot", "shoulder_half_width", "hip_half_width"), 0.06)
+    | {"upper_arm": 0.08, "ankle_height": 0.1, "hand": 0.15, "shoulder_drop": 0.25}
+)
+_RADII = 0.2
+
 # Prior standard deviation of a part's shape: logarithms of a, b, m and h about the values that follow from the
 # dimensions, and metres off the bone along x and y at the beginning and at the end of the axis. Parts between joints
 # keep their lengths. Hands, feet and head end a chain, so their lengths and directions are free. Parts in the median
@@ -62,9 +67,7 @@ class BodyFamily:
         self.groups = build_cone_body(average).shape_groups
         shapes = [_SHAPES.get(name, _LIMB if name.endswith("_") else _TRUNK) for name in self.groups]
         self.mean = np.concatenate([np.log(average.values), np.zeros(SHAPE_NUMBERS * len(self.groups))])
-        self.deviation = np.concatenate(
-            [[_LENGTH if name in _LENGTHS else _OTHER for name in DIMENSIONS], np.ravel(shapes)]
-        )
+        self.deviation = np.concatenate([[_LENGTHS.get(name, _RADII) for name in DIMENSIONS], np.ravel(shapes)])
         self.start = self.mean.copy()
 
     @staticmethod
