@@ -14,7 +14,18 @@ import numpy as np
 import pytest
 
 from scripts import sensitivity
-from scripts.sensitivity import Run, main, measure, scaled, tolerated, value_of
+from scripts.sensitivity import (
+    Run,
+    constants,
+    known_of,
+    main,
+    measure,
+    members,
+    page,
+    scaled,
+    tolerated,
+    value_of,
+)
 from tests.conftest import FITTED
 from tk.cli import main as tk
 
@@ -72,7 +83,7 @@ def test_constant_and_numbers_derived_from_it_change_in_a_process_of_its_own() -
     name = "tk.model.cameras.bundle:EDGE_NOISE_PX"
     ran = subprocess.run(
         [sys.executable, "-c", code],
-        env={**os.environ, sensitivity._VARIABLE: json.dumps([name, 2.0])},
+        env={**os.environ, sensitivity._VARIABLE: json.dumps({name: 2.0})},
         capture_output=True,
         text=True,
         check=True,
@@ -102,3 +113,31 @@ def test_tiny_capture_is_tracked_with_each_value(
     plain, changed = (line.split("mean")[1] for line in lines[2:4])
     assert plain.split()[:2] != changed.split()[:2] and "nan" not in changed
     assert lines[-1] == "changes by less than 100 cm: 2 to 3"
+
+
+def test_group_is_multiplied_together_and_its_divided_members_divided() -> None:
+    assert members("a:X+/b:Y+c.z", 4.0) == {"a:X": 4.0, "b:Y": 0.25, "c.z": 4.0}
+    name = "silhouette.init_frames+tk.trackers.judgement:RECOVER_EVERY"
+    lines = list(measure(name, [0.5, 2.0], lambda run: np.full((1, 2), run.factor), 0.6))
+    assert lines[0] == f"{name} = table" and lines[-1] == "changes by less than 0.6 cm: factors 0.5 to 1"
+
+
+def test_page_has_each_constant_with_its_comment_and_keeps_what_was_measured(tmp_path: Path) -> None:
+    package = tmp_path / "pkg"
+    package.mkdir()
+    source = (
+        '# A length, metres:\n# of two lines.\nA, B = 1.5, 2\nC = A\nD: int = 3  # Behind.\nname = 4\nT = "a | b", 5\n'
+    )
+    (package / "module.py").write_text(source, encoding="utf-8")
+    found = list(constants(package))
+    assert [one.key for one in found] == ["pkg.module:A, B", "pkg.module:D", "pkg.module:T"]
+    assert [one.meaning for one in found][:2] == ["A length, metres: of two lines.", "Behind."]
+    text = page(found, {"pkg.module:A, B": "1 | 2 cm", "pkg.module:T": "2 cm"})
+    assert "| `T` | `('a \\| b', 5)` |" in text and "`D`" not in text
+    assert page(found, known_of(text)) == text
+    assert "2 to 4" in page(found, known_of(text) | {"pkg.module:D": "2 to 4"})
+
+
+def test_page_of_the_package_names_constants_that_exist() -> None:
+    known = known_of((sensitivity.PACKAGE.parent / "docs" / "constants.md").read_text(encoding="utf-8"))
+    assert known and set(known) <= {one.key for one in constants(sensitivity.PACKAGE)}

@@ -14,6 +14,7 @@ from tk.io.results.status import Status
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.skeleton import build_skeleton
+from tk.model.cues.part_colors import RATE
 from tk.trackers.judgement import (
     STATES,
     TORN,
@@ -30,7 +31,7 @@ from tk.trackers.judgement import (
 )
 from tk.trackers.protocol import Estimate
 from tk.trackers.reason import CONSEQUENCES, Reason, is_lost, known_sigma, report_frames, status_of
-from tk.trackers.residual import LEVEL, LEVEL_SPREADS, RATE, RECENT, displacement, level_spread, variance_factor
+from tk.trackers.residual import LEVEL, RECENT, displacement, variance_factor
 
 VIEWS = 4
 
@@ -97,14 +98,11 @@ def test_frames_before_a_loss_or_a_cut_are_no_evidence_about_those_after_it(lost
         assert np.flatnonzero(high == Reason.HIGH).tolist() == [9, 10]
 
 
-def test_mean_of_fewer_frames_has_a_wider_limit() -> None:
-    """A still has the limit of one frame, three standard deviations of a single one above the level."""
-    spreads = [level_spread(frames) for frames in range(1, RECENT + 1)]
-    assert (spreads[0], spreads[-1]) == LEVEL_SPREADS and spreads == sorted(spreads, reverse=True)
+def test_frames_before_a_cut_do_not_count() -> None:
+    """In the first frames of a recording, and in the first ones after a cut, fewer frames count."""
     half = 0.235 / 2
-    assert not suspect(residuals(half, half, 1)).any() and suspect(residuals(half, half, RECENT)).all()
-    # in the first frames of a recording, and in the first ones after a cut, as few count
-    assert not judged(residuals(half, half, RECENT + 2), whole=False, begins=RECENT)[RECENT:].any()
+    assert suspect(residuals(half, half, RECENT)).all() and suspect(residuals(half, half, 1)).all()
+    assert not judged(residuals(half / 2, half / 2, RECENT + 2), whole=False, begins=RECENT)[RECENT:].any()
 
 
 def test_unmeasured_frames_and_views_do_not_count() -> None:

@@ -130,7 +130,9 @@ def test_second_pass_interpolates_the_turn_of_the_head_between_frames_with_landm
     for i in (1, 4):
         landmarks[i] = seen_at(first[i], 0.01)[0]
     tracker, marked = tracker_at(POSES[0]), {NAME: landmarks}
-    poses, _, _ = tracker.second_pass(MASKS, first, np.zeros(6, bool), np.zeros((6, 3, 2)), None, marked, keep_body=True)
+    poses, _, _ = tracker.second_pass(
+        MASKS, first, np.zeros(6, bool), np.zeros((6, 3, 2)), None, marked, keep_body=True
+    )
     found = np.degrees(poses[:, turn])
     np.testing.assert_allclose(found[[1, 4]], [0, 30], atol=8)
     np.testing.assert_allclose(found, np.interp(range(6), [1, 4], found[[1, 4]]), atol=1e-9)
@@ -141,7 +143,9 @@ def test_second_pass_corrects_legs_by_landmarks_of_all_cameras() -> None:
     tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=0.1))
     wrong = np.stack([exchanged(pose, pairs(tracker.limbs))[1] for pose in POSES])
     marked = {NAME: np.stack([seen_at(pose)[0] for pose in POSES])}
-    found, _, _ = tracker.second_pass(MASKS, wrong, np.zeros(6, bool), np.zeros((6, 3, 2)), None, marked, keep_body=True)
+    found, _, _ = tracker.second_pass(
+        MASKS, wrong, np.zeros(6, bool), np.zeros((6, 3, 2)), None, marked, keep_body=True
+    )
     off = np.linalg.norm(SKELETON.joints(found) - SKELETON.joints(POSES), axis=2).max(axis=1)
     assert (off < 3 * CLOSE_M).all()
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from tk.trackers.residual import (
+    LEAST_SPREAD,
     LEVEL,
     OUTLIER,
-    START_SPREAD,
     ResidualBaseline,
     variance_factor,
 )  # fmt: skip
@@ -61,7 +61,7 @@ def test_median_of_the_first_frame_is_the_first_baseline_of_all_views() -> None:
     baseline.learn(halves(first))
     assert baseline.excess(first)[2] > OUTLIER
     # a view without a baseline has that of the others
-    assert baseline.excess(np.full(VIEWS, 0.3 + START_SPREAD))[3] == pytest.approx(1.0)
+    assert baseline.excess(np.full(VIEWS, 0.3 + LEAST_SPREAD))[3] == pytest.approx(1.0)
 
 
 def test_view_with_another_level_gets_its_own_baseline_soon() -> None:

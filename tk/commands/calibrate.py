@@ -89,10 +89,11 @@ def calibrate(ctx: click.Context, folder: Path | None, **given: Any) -> None:
     With --refine or --level, correct the calibration of CAPTURE with a person. Pictures with the same number, or frames
     with the same index, show the same instant.
     """
-    ways = [way for way, name in (("--print", "sheet"), ("--refine", "result"), ("--level", "level")) if given[name]]
-    if len(ways) > 1:
-        raise ConfigError(f"{' and '.join(ways)}: give one of them")
-    way = ways[0] if ways else "a board"
+    names = {"--print": "sheet", "--refine": "result", "--level": "level"}
+    asked = [option for option, name in names.items() if given[name]]
+    if len(asked) > 1:
+        raise ConfigError(f"{' and '.join(asked)}: give one of them")
+    way = asked[0] if asked else "a board"
     _check_options(ctx, way)
     if way == "--print":
         _print(given)

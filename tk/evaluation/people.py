@@ -35,8 +35,7 @@ from tk.model.body.joints import JOINTS
 
 Float = NDArray[np.float64]
 
-#: Largest mean joint distance of a match, m: about the width of a person. A larger value matches people who stand
-#: beside each other (at least 0.77 m by this distance in the capture `pair`); a smaller one counts bad poses as misses.
+#: Largest mean joint distance of a match, m: about the width of a person.
 MATCH_M = 0.5
 
 
@@ -108,7 +107,7 @@ def evaluate_people(result: Sequence[JointTrack], truth: Sequence[JointTrack]) -
     if not frames:
         raise ResultError(f"{result[0].path}: has no frame in common with {truth[0].path}")
     matched: list[dict[int, int]] = [{} for _ in truth]  # for each person of the truth: person of the result by frame
-    within = np.zeros((len(truth), len(result)), np.int64)  # frames in which a pair is within MATCH_M
+    within = np.zeros((len(truth), len(result)), np.int64)  # frames in which two people are within MATCH_M
     distances_m: list[float] = []
     found = 0
     for frame in frames:
@@ -123,7 +122,7 @@ def evaluate_people(result: Sequence[JointTrack], truth: Sequence[JointTrack]) -
         ).reshape(len(true), len(here))
         near = distance <= MATCH_M
         within[np.ix_(true, here)] += near
-        # a pair too far apart costs more than all matches together, so the number of matches is the largest possible
+        # two people too far apart cost more than all matches together, so the number of matches is the largest possible
         for i, j in zip(*scipy.optimize.linear_sum_assignment(np.where(near, distance, 1e6)), strict=True):
             if near[i, j]:
                 matched[true[i]][frame] = here[j]

@@ -32,7 +32,7 @@ from tk.model.masks.image_health import MOST_SHIFT, ImageHealth, Sampled, contra
 from tk.model.masks.image_shift import shift_between
 from tk.model.masks.mask_agreement import INCONSISTENT, Agreement, MaskAgreement
 from tk.model.masks.regions import clean_by_area
-from tk.model.masks.silhouettes import HOLE_SHARE
+from tk.model.masks.silhouettes import HOLE_SHARE, SPECK_SHARE
 from tk.run.segmentation import make_labeller
 from tk.run.task import Task
 from tk.settings import Settings
@@ -41,16 +41,14 @@ from tk.trackers.judgement import FAULTS
 
 Masks = NDArray[np.uint8]
 
-# These values decide which findings are printed, and no tracking result depends on them. With half and twice each value
-# the findings on walk, fold, rig9, pair and treadmill-slow are the same, except for specks in the ragged masks of
-# treadmill-slow (half the value names two cameras more, twice the value one fewer).
-#: frames that are compared; frames whose neighbours, REACH before and after, are also compared
+#: frames that are compared; frames whose neighbours, REACH before and after, are also compared. These values decide
+#: which findings are printed, and no tracking result depends on them.
 _FRAMES, _DELAY_FRAMES = 10, 5
 #: frames that are read, from the first one that all cameras have: videos are decoded in order, so later frames take
 #: longer
 _SPAN = 600
-#: findings, shares of a mask's area: parts that are not connected to the largest one; holes
-_SPECKS, _HOLES = 0.05, 0.01
+#: finding: a larger share of a mask's area is holes
+_HOLES = 0.01
 #: finding: a larger share of the hull at the border of the working volume
 _AT_BORDER = 0.03
 #: finding: a larger angle between the capture's up and the estimated one, degrees
@@ -276,7 +274,7 @@ def _findings(found: Inspection, capture: Capture, agreement: Agreement) -> list
             lines.append(
                 f"camera {c.name} shows the person cut off at the edge of the image in {c.cut:.0%} of the frames"
             )
-        if c.specks > _SPECKS and len(found.people) < 2:
+        if c.specks > SPECK_SHARE and len(found.people) < 2:
             lines.append(f"camera {c.name}: {c.specks:.0%} of its masks is not connected to the largest part")
         if c.holes > _HOLES:
             lines.append(f"camera {c.name}: its masks have holes, {c.holes:.0%} of their area")

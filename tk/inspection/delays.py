@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from tk.model.hull.coarse import Hull
 from tk.model.masks.mask_agreement import Agreement, MaskAgreement
 
-# With half and twice each value the findings on walk, fold, rig9, pair and treadmill-slow are the same.
 #: largest shift of a video that is compared, frames; at the edge it is no optimum
 REACH = 6
 #: a video is delayed if shifting it reduces the share of its masks outside the hull to less than this share of itself,

@@ -25,8 +25,6 @@ from tk.model.cameras.up import UP_AXES, shown, up_text, up_vector
 
 Float = NDArray[np.float64]
 
-# With half and twice each value the findings on walk, fold, rig9, pair and treadmill-slow are the same. The height of
-# the floor changes by 4 cm at most, and with twice the first one nobody in rig9 is taken for a standing person.
 #: least ratio of the largest two standard deviations of a standing person's voxels; people who crouch have less
 _LONG = 1.6
 #: metres, largest second standard deviation of one person's voxels: several people, or a table, are wider

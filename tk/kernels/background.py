@@ -24,9 +24,9 @@ STEPS_PER_OCTAVE = 8
 GREY = (29, 150, 77)
 """Weights of blue, green and red in the brightness (ITU-R BT.601, 256ths)."""
 
-# The results' planes; labels after an even and after an odd number of iterations.
-DIFFERENCE, COLLINEARITY, BRIGHT, LABELS, SPARE = range(5)
-PLANES = 5
+# The results' planes.
+DIFFERENCE, COLLINEARITY, BRIGHT = range(3)
+PLANES = 3
 
 _MANTISSA_SHIFT = 20  # 23 bits of float32 mantissa less log2(STEPS_PER_OCTAVE)
 _LEVEL_ONE = 128  # the level of 1.0
@@ -72,15 +72,6 @@ def _column(images: ti.template(), plates: ti.template(), pixel: ti.i32, width: 
 
 
 @ti.func
-def _relaxed(planes: ti.template(), i: ti.i32, stride: ti.i32, level: ti.i32, per_neighbour: ti.i32, threshold: ti.i32):
-    """Return the label of the pixel at place ``i``, 0 or 1, given the labels of its eight neighbours."""
-    above = planes[i - stride - 1] + planes[i - stride] + planes[i - stride + 1]
-    below = planes[i + stride - 1] + planes[i + stride] + planes[i + stride + 1]
-    count = ti.cast(above + below + planes[i - 1] + planes[i + 1], ti.i32)
-    return ti.cast(level + per_neighbour * (count - 4) >= threshold, ti.u8)
-
-
-@ti.func
 def _clamped(dd: ti.f32, db: ti.f32, bb: ti.f32, shadow_min: ti.f32, light_max: ti.f32) -> ti.f32:
     """Return the least ``|a - s b|² / (1 + s²)``, s in [shadow_min, light_max], from d·d, d·b, b·b with d = a - b."""
     # every product follows from these without cancellation
@@ -92,21 +83,6 @@ def _clamped(dd: ti.f32, db: ti.f32, bb: ti.f32, shadow_min: ti.f32, light_max: 
     return (dd + 2.0 * t * db + t * t * bb) / (1.0 + s * s)
 
 
-@ti.func
-def _relabel(
-    planes: ti.template(), open_pixels: ti.template(), begin: int, end: int, stride: int, per_neighbour: int,
-    threshold: int, iterations: int,
-):  # fmt: skip
-    """Update the labels of the open pixels from ``begin`` to ``end``, all at once, a number of times."""
-    plane = planes.shape[0] // PLANES
-    for iteration in range(iterations):
-        before, after = LABELS + iteration % 2, SPARE - iteration % 2
-        for k in range(begin, end):
-            i = open_pixels[k]
-            level = ti.cast(planes[COLLINEARITY * plane + i], ti.i32)
-            planes[after * plane + i] = _relaxed(planes, before * plane + i, stride, level, per_neighbour, threshold)
-
-
 @ti.kernel
 def _label_kernel(
     # constants: images and plates [C * H * W * 3], 1 / relative noise variance [C * H * W]
@@ -115,8 +91,7 @@ def _label_kernel(
     weights: ti.types.ndarray(dtype=ti.f32, ndim=1),
     # scratch
     squares: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [C * 3 * (W + 2)] |a - b|² of three rows
-    planes: ti.types.ndarray(dtype=ti.u8, ndim=1),  # [PLANES * mosaic] out, from DIFFERENCE to SPARE; zero before
-    open_pixels: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [mosaic] pixels whose labels their neighbours can change
+    planes: ti.types.ndarray(dtype=ti.u8, ndim=1),  # [PLANES * mosaic] out, from DIFFERENCE to BRIGHT; zero before
     # the frame
     precision: ti.types.ndarray(dtype=ti.f32, ndim=1),  # [C] 1 / noise variance
     bright_sum: ti.types.ndarray(dtype=ti.f32, ndim=1),  # [C] a larger sum of the brightness difference is bright
@@ -130,9 +105,6 @@ def _label_kernel(
     shadow_min: ti.f32,
     light_max: ti.f32,
     difference_min: ti.f32,  # noise variances, summed over the window
-    threshold: ti.i32,  # level
-    per_neighbour: ti.i32,  # levels
-    iterations: ti.i32,
 ):
     for turn in range(spread * precision.shape[0]):
         if turn % spread != 0:
@@ -147,9 +119,6 @@ def _label_kernel(
         line = w + 2  # of a row of squares: one more pixel on either side
         row_0 = c * 3 * (width + 2)
         smallest = difference_min / precision[c]
-        swing = 4 * per_neighbour
-        begin = boxes[c, 4] * (plane // stride)  # of its open pixels
-        end = begin
         for y in range(-1, h + 1):  # the statistic is a row behind the squares
             row = row_0 + (y + 1) % 3 * line
             inside = 0 <= top + y < height
@@ -196,16 +165,8 @@ def _label_kernel(
                         residual = _clamped(dd, db, bb, shadow_min, light_max)
                         i = to + x
                         planes[DIFFERENCE * plane + i] = _level(plain * (precision[c] / 54.0))
-                        level = ti.cast(_level(residual * weights[pixel] * (precision[c] / 27.0)), ti.i32)
-                        planes[COLLINEARITY * plane + i] = ti.cast(level, ti.u8)
-                        label = ti.cast(level >= threshold, ti.u8)
-                        planes[LABELS * plane + i] = label
-                        planes[SPARE * plane + i] = label
-                        if level > 0 and threshold - swing <= level < threshold + swing:
-                            open_pixels[end] = i
-                            end += 1
+                        planes[COLLINEARITY * plane + i] = _level(residual * weights[pixel] * (precision[c] / 27.0))
                         planes[BRIGHT * plane + i] = ti.cast(ti.cast(sums[2], ti.f32) > bright_sum[c], ti.u8)
-        _relabel(planes, open_pixels, begin, end, stride, per_neighbour, threshold, iterations)
 
 
 class Statistic:
@@ -218,7 +179,7 @@ class Statistic:
         difference: level of ``|a - b|² / 2`` over 27 noise variances, 0 where it is below the least.
         collinearity: level of the clamped statistic over 27 noise variances, 0 where ``difference`` is.
         bright: 1 where the image is brighter than the scene and ``difference`` is not 0, else 0.
-        labels: 0 or 1.
+        labels: whether ``collinearity`` reaches the threshold.
     """
 
     def __init__(self, images: NDArray[np.uint8], plates: NDArray[np.uint8], weights: NDArray[np.float32]) -> None:
@@ -229,7 +190,8 @@ class Statistic:
         self._squares = np.zeros(cameras * 3 * (self._width + 2), np.int32)
         self._planes = np.zeros((PLANES, 0), np.uint8)
         self._launch: Launcher | None = None
-        self.difference, self.collinearity, self.bright, self.labels = (np.zeros((0, 0), np.uint8) for _ in range(4))
+        self.difference, self.collinearity, self.bright = (np.zeros((0, 0), np.uint8) for _ in range(3))
+        self.labels = np.zeros((0, 0), np.bool_)
 
     def measure(
         self,
@@ -244,14 +206,8 @@ class Statistic:
         light_max: float = 1.0,
         difference_min: float,
         threshold: float,
-        octaves_per_neighbour: float,
-        iterations: int,
     ) -> None:
         """Compare and label the pixels within the boxes: one kernel launch.
-
-        A pixel is labelled where the statistic reaches ``threshold * 2 ** (octaves_per_neighbour * (4 - n))`` with
-        ``n`` of its eight neighbours labelled. The labels start from the bare threshold and are updated all at once, a
-        fixed number of times.
 
         Args:
             precision: (C,) 1 / noise variance, grey levels⁻².
@@ -264,13 +220,13 @@ class Statistic:
             shadow_min: the darkest shadow, as a factor of the plate, in (0, 1].
             light_max: the brightest light, likewise; above 1 where the plate may lie in a shadow.
             difference_min: below this many noise variances of plain difference a pixel is background for certain.
+            threshold: a pixel is labelled where the statistic reaches it, noise variances.
         """
         ensure_runtime()
         size = shape[0] * shape[1]
         if self._launch is None or size > self._planes.shape[1]:
             self._planes = np.zeros((PLANES, size + size // 2), np.uint8)
-            pixels = np.zeros(self._planes.shape[1], np.int32)
-            self._launch = Launcher(_label_kernel, *self._inputs, self._squares, self._planes.reshape(-1), pixels)
+            self._launch = Launcher(_label_kernel, *self._inputs, self._squares, self._planes.reshape(-1))
             self._spread = spread_of(len(precision))
         self._planes[:, :size] = 0
         self._launch(
@@ -285,10 +241,7 @@ class Statistic:
             shadow_min,
             light_max,
             54.0 * difference_min,
-            level_of(threshold),
-            round(octaves_per_neighbour * STEPS_PER_OCTAVE),
-            iterations,
         )
         planes = self._planes[:, :size].reshape(PLANES, *shape)
-        self.difference, self.collinearity, self.bright = planes[:LABELS]
-        self.labels = planes[LABELS + iterations % 2]
+        self.difference, self.collinearity, self.bright = planes
+        self.labels = self.collinearity >= max(level_of(threshold), 1)

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from tk.kernels.kinematics import carried
 from tk.kernels.runtime import ti
 
-# Points nearer to a camera than this are not projected, metres. Half and twice the value change nothing: bodies stay
-# farther away. At 0 a projection divides by zero; beyond the least distance of a body, parts have no contour.
+# Points nearer to a camera than this are not projected, metres.
 NEAREST_M = 0.1
 # The parts that may hide a part are the bits of an int64.
 MOST_PARTS = 64

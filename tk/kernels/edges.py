@@ -41,7 +41,7 @@ ANGLE_SHARE = 0.75
 
 _ANGLE_SCALE = 1 / (2 * math.sin(FULL_ANGLE_RAD / 2))
 _ED_SCALE = 1 / (255 * math.sqrt(3))
-_AXIS_WEIGHT = 10 / 3  # weight of a pair on an axis relative to a pair on a diagonal: Scharr's operator
+_AXIS_WEIGHT = 10 / 3  # weight of two pixels on an axis relative to two on a diagonal: Scharr's operator
 _TINY = 1e-12
 
 

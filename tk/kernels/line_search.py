@@ -15,11 +15,10 @@ from tk.kernels.runtime import ti
 
 # Colour bins: 16 levels of each channel.
 COLOR_BINS = 4096
-# Maximum log likelihood ratio of one pixel (a factor of 20): colour models are not more certain. With 2.1 the mean
-# errors of dance and cube (50 frames) are 0.07 cm higher.
+# Maximum log likelihood ratio of one pixel (a factor of 20): colour models are not more certain.
 MOST_LOG_RATIO = 3.0
 # Neighbouring pixels of a line are correlated (texture, blur, coding): this many count as one. Chosen; sensitivity not
-# measured. At 1 the border's certainty is overestimated.
+# measured.
 _ALIKE_PIXELS = 3.0
 
 
@@ -44,7 +43,7 @@ class SearchSettings:
     # weight of the row along the contour (1: the paper's dx and dy; 0: the distance along the normal)
     tangential: float = 0.3
     # distance at which the Geman-McClure weights (1 + (d/s)²)⁻² are a quarter, in pixels of the scale; 0: the paper's
-    # least squares, which shadows at the feet distort. 8, the window, was chosen on the treadmill and dance captures
+    # least squares, which shadows at the feet distort. 8 is the window
     robust_px: float = 8.0
     # whether contours in front of another part are searched, too, as in the paper. No silhouette edge is expected
     # there, and most edges found belong to other contours. Sharing ambiguous edgels (4.4) corrects this in part;

@@ -201,7 +201,7 @@ class Evaluation(NamedTuple):
 class Linearisation:
     """K = M + Q pairs and the Gauss-Newton Hessian at one pose."""
 
-    residual: np.ndarray  # (K, 3) x − x̄, metres; zero where a pair is missing
+    residual: np.ndarray  # (K, 3) x − x̄, metres; zero where a voxel or sample is missing
     hessian: np.ndarray  # (D, D) Gauss-Newton Hessian of f; outliers weigh at least the given floor
     partner: np.ndarray  # (K,) the voxel, -1 where missing
 

@@ -16,8 +16,7 @@ PIECE_PART, PIECE_PATCHES = PIECE_NUMBERS, PIECE_NUMBERS + 1
 PATCH_BITS = 21
 # Columns of the scratch's rows of pieces, which follow the joints: after the 3×4 frame in the world a bounding sphere.
 SPHERE, SPHERE_RADIUS = 12, 15
-# A point is deep inside a piece where G (1 on the surface, growing linearly from the centre) is below this. With 0.4
-# the mean errors of walk and dance (45 frames) change by 0.03 cm; above 1, parts that touch lose their samples.
+# A point is deep inside a piece where G (1 on the surface, growing linearly from the centre) is below this.
 BURIED = 0.8
 # Indices of the packed settings; the grid of tk.kernels.nearest follows from GRID on.
 INV_SIGMA2, REACH, NU, COVERAGE_NU, SCALE, COVERAGE_SCALE, GRID = range(7)

@@ -30,9 +30,7 @@ _APART_M = 0.3
 _SMOOTH_M = 0.1
 # Radius of a person's column in a block, metres: half the breadth of the shoulders, and a step.
 _BODY_M = 0.35
-# Two columns are two people if the floor plan between them falls to this share of the lower one. Half and twice the
-# value, and those of the prices of candidates below, change the number of people in one of 40 frames of pair and of a
-# rendered embrace at most.
+# Two columns are two people if the floor plan between them falls to this share of the lower one.
 _SADDLE = 0.7
 # Two people in one component have at least this share of the volume that they had apart: more than one of two equals.
 _TOGETHER = 0.75

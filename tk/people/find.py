@@ -38,10 +38,9 @@ _VOXEL_M = 0.06
 # Rows of the images that are used, approximately: a voxel has then about two pixels at 4 m.
 _ROWS = 240
 # A person costs as much as this area of unexplained pixels, sum over the views, m²: half the silhouette of an adult in
-# one view. A ghost explains less than 0.1, a person half hidden in four views explains 1.
+# one view. Half of it, unexplained in a camera, starts a search for others.
 _LEAST_AREA_M2 = 0.3
 # By which the extent of a hull exceeds the height, metres: soles, hair, and what is carved too little below the feet.
-# Mean of eight people of the development captures; after it, heights are wrong by 0.06 at most.
 _EXCESS_M = 0.02
 # People whose feet differ in height by less than this share a floor, metres: jumps are as high.
 _ONE_FLOOR_M = 0.3
@@ -54,8 +53,6 @@ _STEEP = 0.7
 # Weight of pixels that a candidate covers beside the masks: furniture may hide a person in several cameras, and the
 # candidate's silhouette is up to twice as large as the person's.
 _CONTRADICTED = 0.25
-# Area that the people leave unexplained in a camera before a search for others, m²: a quarter of a person.
-_LEFT_M2 = 0.15
 # The heights of two people are compared in steps of this, metres: hair, shoes and half a voxel at both ends.
 _HEIGHT_STEP_M = 0.1
 # Half the width and half the height of the space in which one person is followed, metres; and how far this person may
@@ -191,7 +188,7 @@ class PeopleFinder:
     def _unexplained(self, masks: Bool, people: Sequence[LocatedPerson]) -> Bool:
         """Return (C,) whether people leave much of a camera's mask, (C, h, w) reduced, unexplained."""
         left = masks & ~self._covered(people)
-        return np.asarray(left.sum(axis=(1, 2)) * self._pixel_m2 > _LEFT_M2)
+        return np.asarray(left.sum(axis=(1, 2)) * self._pixel_m2 > _LEAST_AREA_M2 / 2)
 
     def around(self, position: Float, masks: NDArray[np.uint8], count: int = 0) -> tuple[Float, Float]:
         """Return the hull of one person who was at a position (3,) a frame ago, and the new position.

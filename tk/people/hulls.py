@@ -18,11 +18,7 @@ from tk.trackers.protocol import Frame
 
 Float = NDArray[np.float64]
 
-# A view shows somebody unknown if a connected region that is not near a hull has this share of a person's area.
-_STRANGER_SHARE = 0.03
-# A hull has people's pixels mixed up if its volume changes by this factor in the opening. With 1.5, one of two people
-# who begin beside each other (pair, frame 30) has a body of three frames; limbs of both are 4.8 and 2.1 cm off, with 2
-# 2.6 and 2.2.
+# A hull has people's pixels mixed up if its volume changes by this factor in the opening.
 _MIXED = 2.0
 
 
@@ -38,7 +34,7 @@ def owners_by_hulls(
         sighted: bodies that landmarks in the frame show.
     """
     hulls = [cast_points(rig, grid, person.points, person.voxel_m) for person in people]
-    return assign(rig, grid, _in_place(sighted, hulls), frame, _STRANGER_SHARE)
+    return assign(rig, grid, _in_place(sighted, hulls), frame)
 
 
 def shares_by_hulls(
@@ -69,14 +65,14 @@ def shares_by_hulls(
     mixed = [False] * len(people)
     for frame in frames:
         seen = sighted(frame)
-        owners = assign(rig, grid, _in_place(seen, hulls), frame, _STRANGER_SHARE)
+        owners = assign(rig, grid, _in_place(seen, hulls), frame)
         if frame is not frames[0]:
             for k, place in enumerate(places):
                 points, places[k] = finder.around(place, owners.share(frame, k).masks, counts[k])
                 if len(points):
                     counts[k], hulls[k] = len(points), cast_points(rig, grid, points, finder.voxel_m)
             at_first = at_first or list(counts)
-            owners = assign(rig, grid, _in_place(seen, hulls), frame, _STRANGER_SHARE)
+            owners = assign(rig, grid, _in_place(seen, hulls), frame)
             for k, (count, first) in enumerate(zip(counts, at_first, strict=True)):
                 mixed[k] |= not 1 / _MIXED < count / first < _MIXED
         for k, own in enumerate(shares):

@@ -30,11 +30,8 @@ Float = NDArray[np.float64]
 # People are in contact if their pelvises are closer than this, metres: arms reach so far.
 CONTACT_M = 1.0
 # An assignment is clear if its log-likelihood, mean per pixel and summed over both people, exceeds that of the other by
-# this. At the ends of six contacts (pair, a crossing, a handshake, an embrace) the right one exceeds it by 4.2 to 5.7.
+# this.
 CLEAR = 0.3
-# Without a clear assignment the people are kept if an exchange would lengthen the steps of the two pelvises by this in
-# any frame, metres: people whose pelvises stay half a metre apart are not mixed up.
-APART_M = 1.0
 
 OPEN, KEPT, EXCHANGED, UNCLEAR = range(4)
 
@@ -136,6 +133,9 @@ def judge_contacts(contacts: Contacts, tracked: Sequence[Person], answers: Mappi
 def outcome_of(likeness: Float, shorter_m: float) -> int:
     """Return the outcome of a contact.
 
+    Without a clear assignment the people are kept if an exchange would lengthen the steps of the two pelvises by
+    :data:`CONTACT_M` in any frame: people whose pelvises stay half as far apart are not mixed up.
+
     Args:
         likeness: (2, 2) log-likelihood of trajectory i as person j.
         shorter_m: see :class:`Contact`.
@@ -143,7 +143,7 @@ def outcome_of(likeness: Float, shorter_m: float) -> int:
     kept, exchanged = np.trace(likeness), np.trace(likeness[::-1])
     if abs(kept - exchanged) > CLEAR:
         return KEPT if kept > exchanged else EXCHANGED
-    return UNCLEAR if shorter_m > -APART_M else KEPT
+    return UNCLEAR if shorter_m > -CONTACT_M else KEPT
 
 
 def exchanged(people: Sequence[Result], contacts: Sequence[Contact]) -> tuple[Result, ...]:

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ConfigError
 from tk.kernels.mask_values import OTHERS, PERSON
+from tk.model.body.body_fit import INFORMATIVE_FRAMES
 from tk.model.cues.part_colors import RenderedBody
 from tk.model.cues.ray_costs import RayGrid
 from tk.model.masks.image_health import contradiction, sampled
@@ -45,17 +46,12 @@ _LOG = logging.getLogger(__name__)
 
 # Seconds between two searches for people who enter.
 LOOK_EVERY_S = 0.5
-# Frames of the opening in which other people are searched for if the person in the first frame cannot be tracked.
-_TESTED = 4
-# Frames of somebody who enters to which the body is fitted: half a second at 15 Hz.
-_HISTORY = 8
 # After each refusal of somebody who enters the next attempt is twice as far away, up to this multiple of LOOK_EVERY_S:
 # a start takes seconds. The first attempt often fails, because the person is still partly out of view.
 _LONGEST_PAUSE = 8
 # Least share of the area of a person who is tracked that must be unexplained in two views before a search.
 _LEAST_UNEXPLAINED = 0.25
-# Likeness by the colours above which somebody who enters is a person who has left. On pair and a rendered crossing, by
-# colours and body: -0.1 to -0.7 for the same person, -1.6 to -3.7 for the other one.
+# Likeness by the colours above which somebody who enters is a person who has left.
 _SAME_COLORS = -1.1
 
 
@@ -92,7 +88,7 @@ class People:
         self._tracked: list[Person] = []
         self._contacts = Contacts()
         self._every = max(1, round(LOOK_EVERY_S * setup.fps))
-        self._unknown: deque[Frame] = deque(maxlen=_HISTORY)  # people who are unknown, in the last frames
+        self._unknown: deque[Frame] = deque(maxlen=INFORMATIVE_FRAMES)  # people who are unknown, in the last frames
         self._refused = 0  # consecutive people who could not be tracked
         self._admit_from = 0  # the frame from which on another may be
         # numbers, as `tk inspect` prints them, of the people who have had a tracker; None before the first frame
@@ -238,7 +234,7 @@ class People:
 
     def _several_in(self, opening: Sequence[Frame]) -> bool:
         """Return whether several people are found in some frame of the opening."""
-        return any(len(self._finder.find(f.masks, f.uncertain)) > 1 for f in spread_over(opening, _TESTED))
+        return any(len(self._finder.find(f.masks, f.uncertain)) > 1 for f in spread_over(opening))
 
     def _shares(self, people: Sequence[LocatedPerson], frames: Sequence[Frame]) -> list[list[Frame]]:
         """Return the observations of each person in consecutive frames, from the hulls in the first one."""
@@ -311,7 +307,7 @@ class People:
         if due and not numbered:  # who is not written, and lost, comes back as a newcomer
             self._tracked = [p for p in self._tracked if p.written or not p.lost]
         searching = any(p.lost and not p.absent for p in self._tracked)
-        if searching or len(self._unknown) < _HISTORY or frame.index < self._admit_from:
+        if searching or len(self._unknown) < INFORMATIVE_FRAMES or frame.index < self._admit_from:
             return {}
         answers: dict[int, Answer] = {}
         for newcomer in newcomers:

@@ -16,17 +16,13 @@ from tk.model.body.joints import JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.setup import Subject
 from tk.model.stateful import Stateful
-from tk.people.share import STRANGER_SHARE
+from tk.people.share import REACH_M, STRANGER_SHARE
 from tk.trackers.camera_monitor import CameraMonitor, MonitorState
 from tk.trackers.protocol import Estimate, Frame, SharingTracker, Tracker, sharing, without_cameras
 from tk.trackers.reason import Reason
 from tk.trackers.registry import TrackerState
 
 Float = NDArray[np.float64]
-
-# Pixels farther from the body of a person who is alone than this, metres, may show somebody else: more than half a
-# frame's motion of a fist.
-_ALONE_M = 0.25
 
 
 @dataclass(frozen=True)
@@ -137,7 +133,8 @@ class Person(Stateful[PersonMotion]):
             area = np.count_nonzero(body)
             if np.count_nonzero(cells) <= (1 + STRANGER_SHARE) * area:
                 continue
-            reach = _ALONE_M * camera.pixels_per_metre(self.place) / tracker.coarse_grid.step
+            # the unpredicted half of a fist's motion
+            reach = REACH_M / 2 * camera.pixels_per_metre(self.place) / tracker.coarse_grid.step
             size = 2 * max(round(reach), 1) + 1
             near = cv2.dilate(body.view(np.uint8), np.ones((size, size), np.uint8)) > 0
             if np.count_nonzero(cells & ~near) > STRANGER_SHARE * area:

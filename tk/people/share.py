@@ -34,16 +34,14 @@ Float = NDArray[np.float64]
 Single = NDArray[np.float32]
 Bool = NDArray[np.bool_]
 
-# The numbers of the segmentation. Behind each: the mean error of all joints, first pass, with other values, over the
-# four people of a rendered embrace and of two people who circle each other; 3.07 cm with these.
 # Scale of the logistic distributions by which outline and depth of a body differ from those at the expected pose,
-# metres (0.03: 3.27, 0.06: 3.07). NEAR_M: an outline errs by less with a probability of 0.95.
+# metres. NEAR_M: an outline errs by less with a probability of 0.95.
 ERROR_M = 0.04
 NEAR_M = 3 * ERROR_M
 # How far a pixel may lie from a body to be that person's, metres: a fist at 8 m/s moves so far in a frame at 15 Hz.
 REACH_M = 0.5
-# Edge of the square over which the evidence of colours is averaged, pixels (1: 3.21, 5: 3.10, 9: 3.23). The colours
-# around a pixel favour a person by MOST_LOG_RATIO at most (2: 3.24, 5: 3.10).
+# Edge of the square over which the evidence of colours is averaged, pixels. The colours around a pixel favour a person
+# by MOST_LOG_RATIO at most.
 _AVERAGED_PX = 3
 # A view shows somebody unknown if a connected region that is not near has this share of a person's area. A fast arm
 # that is not where it is expected has 0.05.
@@ -125,9 +123,7 @@ class _Shape(NamedTuple):
         return _Shape(number, away, label.ravel().take(at), depth.ravel().take(at), body)
 
 
-def assign(
-    rig: Rig, grid: RayGrid, bodies: Sequence[RenderedBody | None], frame: Frame, stranger_share: float = STRANGER_SHARE
-) -> PixelOwners:
+def assign(rig: Rig, grid: RayGrid, bodies: Sequence[RenderedBody | None], frame: Frame) -> PixelOwners:
     """Return the owner of each pixel of the masks.
 
     Args:
@@ -135,12 +131,11 @@ def assign(
         grid: the cells.
         bodies: of each person the body, or the hull, on the grid; None if it is unknown where the person is.
         frame: images and masks. Pixels with values below 128 have no owner.
-        stranger_share: see :data:`STRANGER_SHARE`.
     """
     shown = grid.sample(frame.masks) >= PERSON
     owner = np.full(frame.masks.shape, NOBODY, np.int8)
     areas = [np.count_nonzero(body.label, axis=(1, 2)) for body in bodies if body is not None]
-    least = stranger_share * float(np.median(areas)) if areas else 0.0
+    least = STRANGER_SHARE * float(np.median(areas)) if areas else 0.0
     claims = _claims(grid, frame, bodies, shown)
     colored = frame.images.size > 0 and any(body is not None and body.log_likelihood is not None for body in bodies)
     for v, camera in enumerate(rig):

@@ -17,12 +17,13 @@ from tk.model.cameras.camera import Rig
 from tk.model.cues.ray_costs import RayGrid, residual_of
 from tk.trackers.contour_finder import COARSE_ROWS
 
-# Whole frames of a video's delay that are tried before the refinement, whose edges reach some pixels only; and the
-# frames in which they are tried. A delay at the edge of the range is no optimum: the range is then doubled, at most to
-# MOST frames, which takes some seconds. A video is late if its share of wrong pixels is above the median camera's by
-# the first factor, and falls below the second without the delay. Two frames late at 15 Hz gave no delay without this.
-REACH, MOST, DELAY_FRAMES = 5, 80, 12
-_WORSE, _MENDED = 1.3, 0.8
+# Frames of a recording in which delays, headings or runs are compared.
+COMPARED = 12
+# Whole frames of a video's delay that are tried before the refinement, whose edges reach some pixels only. A delay at
+# the edge of the range is no optimum: the range is then doubled, at most to MOST frames, which takes some seconds.
+REACH, MOST = 5, 80
+# A video is late if its share of wrong pixels falls below this factor without the delay.
+_MENDED = 0.8
 # Least share of wrong pixels that is compared, a tenth of what correct cameras have: drawn masks have none.
 _EXACT = 0.01
 
@@ -43,7 +44,7 @@ def whole_delays(people: Sequence[TrackedPerson], rig: Rig) -> NDArray[np.int64]
     The cameras are in the world of the poses.
     """
     grid = RayGrid(rig, COARSE_ROWS)
-    shares_of = [_shares_by_delay(person, grid, -(-DELAY_FRAMES // len(people))) for person in people]
+    shares_of = [_shares_by_delay(person, grid, -(-COMPARED // len(people))) for person in people]
     late, unknown, reach = np.zeros(len(rig), np.int64), np.ones(len(rig), np.bool_), REACH
     while unknown.any() and reach <= MOST:
         shares = np.concatenate([of_delays(range(-reach, reach + 1)) for of_delays in shares_of], axis=1)
@@ -83,8 +84,7 @@ def _shares_by_delay(person: TrackedPerson, grid: RayGrid, count: int) -> Callab
 
 
 def _best_delays(shares: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return (C,) the delay with the fewest wrong pixels of cameras that have more of them than others, 0 of others;
-    and (C,) whether the delay mends the camera.
+    """Return (C,) the delay with the fewest wrong pixels of each camera, and (C,) whether it mends the camera.
 
     Args:
         shares: (2 N + 1, R, C) shares of wrong pixels with delays of -N to N frames; NaN where a camera shows nobody.
@@ -96,9 +96,7 @@ def _best_delays(shares: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArra
     # A delay mends most frames. A camera that is turned at some time has frames of its old place within the largest
     # delay after the turn, but in the frames before, every delay is worse.
     change = np.ma.filled(np.ma.median(known / now, axis=1), 1.0)
-    mean = np.ma.filled(now.mean(axis=0), 0.0)
-    worse = mean > _WORSE * np.median(mean)
-    return np.where(worse, np.argmin(change, axis=0) - reach, 0), change.min(axis=0) < _MENDED
+    return np.argmin(change, axis=0) - reach, change.min(axis=0) < _MENDED
 
 
 def retimed(store: MaskStore, frames: NDArray[np.int64], late: NDArray[np.int64]) -> MaskStore:

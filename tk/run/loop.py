@@ -20,6 +20,7 @@ from tk.io.results.data import HullPoints, Value
 from tk.io.results.reader import as_damage_error, read_result
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
+from tk.model.body.body_fit import INFORMATIVE_FRAMES
 from tk.people.people import People, PeopleState
 from tk.people.person import Answer
 from tk.run.offline import REFINED
@@ -35,9 +36,8 @@ Row = dict[str, ArrayLike]
 # time costs more writes; a longer one loses more frames when the process is killed.
 WRITE_EVERY_S = 0.5
 
-# Most bytes of the frames that are held at the start, and least number of these frames: of eight 4K cameras at full
-# size 12 instead of 24. Fewer frames make the body less certain, see tk.model.body.body_fit.
-_OPENING_BYTES, _LEAST_OPENING = 4_000_000_000, 8
+# Most bytes of the frames that are held at the start, unless the body needs more: of eight 4K cameras 12 frames.
+_OPENING_BYTES = 4_000_000_000
 
 _ORIGIN = "run/"
 
@@ -153,7 +153,7 @@ class Loop:
         task, count = self.plan.task, self.plan.tracker.opening_frames
         rig = task.setup.rig
         held = 5 * len(rig) * math.prod(rig.frame_shape)  # bytes of a frame: image, mask and uncertain pixels
-        fewer = min(count, max(_OPENING_BYTES // held, _LEAST_OPENING))
+        fewer = min(count, max(_OPENING_BYTES // held, INFORMATIVE_FRAMES))
         if fewer < count:
             self._note(
                 f"{task.source.where}: the images are large; the body is fitted to {fewer} frames instead of {count}"

@@ -23,7 +23,7 @@ from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
 from tk.people.identity import COLUMNS, doubtful, exchanged, exchanged_masks, report
 from tk.people.people import People
-from tk.run.delays import TrackedPerson, retimed, retimed_measured
+from tk.run.delays import COMPARED, TrackedPerson, retimed, retimed_measured
 from tk.run.draft import Draft, held, without_absent
 from tk.run.prefetch import open_observations
 from tk.run.refinement import compare_cameras, refine_if_inconsistent
@@ -37,10 +37,6 @@ from tk.trackers.reason import Reason, known_sigma, report_frames, status_of
 _LOG = logging.getLogger(__name__)
 Float = NDArray[np.float64]
 Note = Callable[[str], None]
-
-# Frames in which the opposite heading is compared. With 8, 12 and 20, the decisions about five faults of a
-# generated recording, two of them tracked back to front, are right in 5, 5 and 4.
-HEADING_FRAMES = 12
 
 #: entry in `/model` of a result after the second pass
 REFINED = "refined"
@@ -202,7 +198,7 @@ class _Finisher:
         rows = np.flatnonzero(~draft.lost)
         if not len(rows) or self.task.source.frame_count is None:
             return tracker
-        rows = rows[np.unique(np.linspace(0, len(rows) - 1, HEADING_FRAMES).round().astype(int))]
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, COMPARED).round().astype(int))]
         poses, unused = draft.current("pose"), np.isnan(draft.current("residual")[..., 0])
         measured = self._measured(draft, self.late)
 

@@ -14,13 +14,14 @@ from tk.io.captures.capture import Capture
 from tk.io.captures.mask_store import MaskStore
 from tk.io.paths import check_output
 from tk.io.results.reader import read_result
+from tk.model.body.body_fit import INFORMATIVE_FRAMES
 from tk.model.cameras.bundle import TrackedPoses
 from tk.model.cameras.refinement import Refined, RefinementSettings
 from tk.model.cameras.tracker_frame import TrackerFrame
 from tk.run.delays import TrackedPerson
 from tk.run.plan import reduce_images
 from tk.run.prefetch import open_observations
-from tk.run.refinement import FEWEST, refine_rig
+from tk.run.refinement import refine_rig
 from tk.run.task import Task
 from tk.settings import Settings
 from tk.threads import one_thread
@@ -67,7 +68,8 @@ def refine_capture(
     done = refine_rig([person], world.rig, how)
     if done is None:
         raise CaptureError(
-            f"{result}: has too few consecutive tracked frames to refine {capture.path}; {FEWEST} are needed"
+            f"{result}: has too few consecutive tracked frames to refine {capture.path}; "
+            f"{INFORMATIVE_FRAMES} are needed"
         )
     read = np.array(capture.late_frames) / capture.fps
     # what is new is added to the file's delays: those of the capture may include distances from its clock's frames

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.model.body.body_fit import INFORMATIVE_FRAMES
 from tk.model.cameras.agreement import LATE_FRAMES, CameraAgreement, camera_agreement
 from tk.model.cameras.bundle import choose_frames
 from tk.model.cameras.camera import Rig
@@ -18,13 +19,10 @@ from tk.run.delays import TrackedPerson, whole_delays
 
 Float = NDArray[np.float64]
 
-# Frames of a refinement, and of a check of the cameras' agreement, at most and at least. On dance with turned cameras
-# 16, 24 and 40 frames give the same joints within 0.02 cm. Fewer than eight show little motion; these
-# recordings are longer, so the least number changes nothing on them.
-FRAMES, FEWEST = 20, 8
+# Frames of a refinement, and of a check of the cameras' agreement, at most.
+FRAMES = 20
 # Refined cameras are used if they reduce the contours' distance to less than this share. One of five cameras turned by
-# the least angle that counts as inconsistent, 0.06° or 0.8 px, reduces a distance of 1.4 px to 0.96 of it. On dance
-# with turned cameras the share is 0.87.
+# the least angle that counts as inconsistent, 0.06° or 0.8 px, reduces a distance of 1.4 px to 0.96 of it.
 _WORTHWHILE = 0.98
 # Largest number of refinements while the whole frames of the videos' delays still change.
 _SHIFTS = 3
@@ -70,12 +68,12 @@ def _chosen(
     late: NDArray[np.int64] | None = None,
 ) -> list[Filmed] | None:
     """Return frames of each person, an equal number of all if possible; None if there are too few."""
-    count = max(FRAMES // max(len(people), 1), FEWEST)
+    count = max(FRAMES // max(len(people), 1), INFORMATIVE_FRAMES)
     found: list[Filmed] = [
         (p.body, choose_frames(p.masks, views, p.body.skeleton, p.tracked, count, scales, cleaning, late))
         for p in people
     ]
-    return found if sum(len(frames) for _, frames in found) >= FEWEST else None
+    return found if sum(len(frames) for _, frames in found) >= INFORMATIVE_FRAMES else None
 
 
 def compare_cameras(people: Sequence[TrackedPerson], views: Views) -> CameraAgreement | None:

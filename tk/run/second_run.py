@@ -20,14 +20,13 @@ from tk.io.captures.source import Source
 from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.cues.ray_costs import RayGrid, residual_of
 from tk.model.setup import InitPose, Setup, Subject
+from tk.run.delays import COMPARED
 from tk.trackers.camera_monitor import CameraMonitor
 from tk.trackers.contour_finder import COARSE_ROWS
 from tk.trackers.protocol import Estimate, Frame, TwoPassTracker, shows_person
 
 Float = NDArray[np.float64]
 
-# Frames in which two runs are compared, at most.
-_COMPARED = 40
 # A camera is judged again if the first run left it out of this share of the frames in which it shows the person.
 # Tracking again takes as long as the first pass.
 _LEFT_OUT = 0.1
@@ -103,7 +102,7 @@ def explains_better(second: Run, first: Run) -> bool:
     frames = np.intersect1d(second.frames, first.frames)
     if not len(frames):
         return False
-    frames = frames[np.unique(np.linspace(0, len(frames) - 1, _COMPARED).round().astype(int))]
+    frames = frames[np.unique(np.linspace(0, len(frames) - 1, COMPARED).round().astype(int))]
     new, old = second.wrong_pixels(frames), first.wrong_pixels(frames)
     both = np.isfinite(new) & np.isfinite(old)
     return bool(both.any() and new[both].mean() < old[both].mean())

@@ -39,8 +39,7 @@ Signals = tuple[float, Float]
 _RATES = (24, 25, 30, 50, 60, 120, 240)
 #: how many times slower a video may be played than it was recorded
 _SPEEDS = sorted({recorded / said for said in _RATES for recorded in _RATES if recorded != said})
-#: seconds in which motion is summed to compare places. Half and twice as many name the same exchanged videos; with
-#: twice as many, two of 11 right folders have a note.
+#: seconds in which motion is summed to compare places.
 _BIN_S = 0.25
 #: least probability of what no line questions. Right videos of four cameras and more reached it in all folders of 11 s
 #: and more, those of two and three cameras in 57 of 95 sets; exchanged ones in none.

@@ -21,7 +21,7 @@ from tk.synchronise.raw import Recording
 Float = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-#: longer side of the small images, pixels. With 320 the offsets of known cameras are the same to a millisecond.
+#: longer side of the small images, pixels.
 SIDE_PX = 160
 #: seconds of each recording that are looked at, and highest rate, 1/s. Offsets up to a minute leave two in common.
 LOOKED_S, _MOST_HZ = 180.0, 62.0

@@ -30,7 +30,7 @@ LEAST_S = 2.0
 #: seconds by which a lag may differ from the best one and be the same: twice the width of most motions. Twice as many
 #: change no answer of :mod:`tk.synchronise.faults`; with half of it, one of 11 right folders has a false speed.
 NEAR_S = 0.35
-#: planes of a pair of cameras; share of the motion beyond the planes at each end
+#: planes of two cameras; share of the motion beyond the planes at each end
 _PLANES, _BEYOND = 48, 0.01
 #: least sine of the angle between a ray and the line through both cameras: beside it, planes are not determined
 _LEAST_SINE = 0.2

@@ -15,7 +15,7 @@ RATE_SIGMA = 50e-6
 #: standard deviation of the time between sound and pictures of a camera, seconds: a way of some metres, and what the
 #: device adds
 SOUND_SIGMA_S = 0.015
-#: a pair of cameras is an outlier if its ties differ from the others' solution by more than so many sigma, and by more
+#: two cameras are an outlier if their ties differ from the others' solution by more than so many sigma, and by more
 #: than this, seconds
 _OUTLIER_SIGMA, _OUTLIER_S = 5.0, 0.01
 #: a rate counts as determined if its standard deviation is below this, relative

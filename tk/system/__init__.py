@@ -1,7 +1,7 @@
 """What differs between operating systems: files without a name, locks, processes, signals, folders, the machine.
 
-No other module uses what only some systems have; a test checks it. What differs has two ways: that of Linux, and a
-portable one for all other systems. The environment variable ``TK_PORTABLE=1`` chooses the portable way on Linux, too,
+No other module uses what only some systems have; a test checks it. What differs has two variants: that of Linux, and
+a portable one for all other systems. The environment variable ``TK_PORTABLE=1`` chooses the portable one on Linux, too,
 where the tests run it.
 """
 

@@ -45,9 +45,9 @@ Span = tuple[int, int, int]
 """Frames: the first, the last, and their number."""
 
 
-def spread_over(frames: Sequence[T], count: int = _OPENING) -> list[T]:
-    """Return this many of the opening's frames, spread over it."""
-    return [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))]
+def spread_over(frames: Sequence[T]) -> list[T]:
+    """Return :data:`_OPENING` of the opening's frames, spread over it."""
+    return [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, _OPENING).round().astype(int))]
 
 
 def image_faults(frames: Sequence[Frame]) -> NDArray[np.bool_]:

@@ -57,8 +57,7 @@ ESTIMATED_STATURE_DEVIATION = 0.05
 MOST_STATURE_RATIO = 1.35
 # Information of one pixel of contour, 1/px²: edgels err by 2 px. The unit of the contours' equations.
 INFORMATION = 1.0 / (2.0**2 * CORRELATION_PX)
-# Cameras that the search at the start uses, at most. More cost time and hardly add a direction: with 8 of the 16
-# cameras of sixteen the mean error of the joints changes by less than 0.1 cm. The body is fitted with all of them.
+# Cameras that the search at the start uses, at most. The body is fitted with all of them.
 OPENING_CAMERAS = 8
 # Rows of the grid of rays: to screen many candidates of a limb, and to choose among few poses.
 COARSE_ROWS, FINE_ROWS = 54, 96
@@ -317,7 +316,6 @@ class ContourFinder:
         images: NDArray[np.uint8] | None = None,
         prior: Quadratic | None = None,
         limb: Limb | None = None,
-        solver: GaussNewtonSettings | None = None,
     ) -> BatchSolution:
         """Minimise by Gauss-Newton from poses (B, D), all in one frame or each in its own.
 
@@ -328,7 +326,6 @@ class ContourFinder:
             images: with images, colour differences attract contours inside the silhouette, too.
             prior: of the poses, in the units of the contours' equations, see :data:`INFORMATION`.
             limb: only this limb moves.
-            solver: iterations at each scale; None: :attr:`solver`.
         """
         body = self.body
         arrays, free = (limb.arrays, limb.dofs) if limb else (body.arrays, None)
@@ -341,7 +338,7 @@ class ContourFinder:
             free,
             body.skeleton.lower,
             body.skeleton.upper,
-            solver or self.solver,
+            self.solver,
             self.terms(pyramid, prior),
             levels,
         )

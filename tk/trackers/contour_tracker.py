@@ -19,14 +19,10 @@ from tk.model.stateful import Stateful
 from tk.trackers.contour_finder import ContourFinder, Seen
 from tk.trackers.proposals import anywhere
 from tk.trackers.protocol import Estimate, Frame
+from tk.trackers.residual import LEVEL
 
 Float = NDArray[np.float64]
 S = TypeVar("S")
-
-# As long as a person stays lost, the search from the centroid of the silhouettes runs once in so many frames.
-RECOVER_EVERY = 3
-# Probability that a ray contradicts the person's own body: the residual (E_S) of the development captures.
-WRONG = 0.1
 
 
 class ContourTracker(ContourFinder, Stateful[S], ABC):
@@ -90,7 +86,7 @@ class ContourTracker(ContourFinder, Stateful[S], ABC):
             frame: the observation of a person.
             learned: colours of this person; None: the present ones.
             pose: (D,) the person's pose, in the tracker's frame. With it, the body counts, too: a pixel is wrong with
-                the probability :data:`WRONG`.
+                the probability :data:`~tk.trackers.residual.LEVEL`.
         """
         colors = self.colors
         if learned is not None:
@@ -104,7 +100,7 @@ class ContourTracker(ContourFinder, Stateful[S], ABC):
             return by_color
         pyramid = self.pyramid(frame)
         residual = self.mean_residual(pyramid, self.settle(pyramid, pose[None]).states, frame.uncertain)[0]
-        return by_color - float(np.log(1 / WRONG - 1) * min(residual, 1.0))
+        return by_color - float(np.log(1 / LEVEL - 1) * min(residual, 1.0))
 
     def cleaned(self, masks: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return masks (V, H, W) after cleaning."""

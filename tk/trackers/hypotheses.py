@@ -17,11 +17,10 @@ Float = NDArray[np.float64]
 DROPPED = float(np.log(1000.0))
 # A pose that has not settled at the finest scale is not refined if it costs so much more than the present one, nats.
 PROPOSED = 16.0
-# Frames during which a hypothesis is tracked beside the best one, and the share of its running cost that a frame
-# replaces. Half and twice of each change the mean errors of dance and cube (50 frames) by less than 0.1 cm.
-PATIENCE, RENEWAL = 6, 0.4
-# Poses whose joints all differ by less than this, metres, are one; at the start, before the body is fitted.
-SAME_POSE_M, SAME_START_M = 0.05, 0.15
+# Share of a hypothesis's running cost that a frame replaces.
+RENEWAL = 0.4
+# Poses whose joints all differ by less than this, metres, are one. (Before they settle: tk.model.body.limb_candidates.)
+SAME_POSE_M = 0.05
 # Prior of a person who moves forwards rather than backwards, nats, and the way, metres, of which the half shows it.
 FORWARDS, WAY_M = 3.0, 0.5
 

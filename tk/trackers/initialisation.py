@@ -22,11 +22,12 @@ from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import AVERAGE_BODY
 from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.initial_pose import GREATEST_STATURE, LEAST_STATURE
+from tk.model.body.limb_candidates import DISTINCT_M
 from tk.model.body.skeleton import Skeleton
 from tk.model.cues.ray_costs import Evidence
 from tk.model.masks.silhouettes import Pyramid
 from tk.model.setup import AVERAGE_STATURE_M
-from tk.trackers.hypotheses import DROPPED, SAME_START_M, TrajectoryHypothesis, different, walking
+from tk.trackers.hypotheses import DROPPED, TrajectoryHypothesis, different, walking
 from tk.trackers.proposals import anywhere, landmarks, opposite
 from tk.trackers.proposals.anywhere import centroid
 
@@ -37,24 +38,11 @@ Float = NDArray[np.float64]
 
 # Poses whose opposite heading is proposed, too.
 OPPOSITE = 2
-# Frames of the opening in which the person is searched for, in turn. The search ends at a residual (E_S) of CLEAR: on
-# the development captures an average body of the right stature has 0.15 to 0.31 in the right pose and never less than
-# 0.25 in a wrong one.
+# Frames of the opening in which the person is searched for, in turn, and the residual (E_S) at which the search ends.
 ANCHORS, CLEAR = 4, 0.2
-# An average body errs in all frames alike, so the opening counts as much as one frame. Legs that change places explain
-# a walk equally well but for noise: the prior of a hypothesis that faces the same way as the best one in its frame is
-# e^-EXCHANGE.
-EXCHANGE = 6.0
-# A frame in which the residual is higher than the anchor's by this factor triggers a limb search.
-WORSE = 1.2
-# A pose with a higher residual explains nothing: twice what an average body of the right stature leaves. Without a
-# better one in any of the frames the person is not found.
-EXPLAINS_NOTHING = 0.6
 # Alternatives that are followed through the opening, the likeliest of each anchor first: where nothing fits, each takes
-# seconds. Half and twice as many change no mean error of dance and cube (50 frames).
+# seconds.
 FOLLOWED = 8
-# A search that finds a better pose is repeated, at most this often.
-_SEARCHES = 2
 
 
 def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None = None) -> list[TrajectoryHypothesis]:
@@ -70,11 +58,11 @@ def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None 
         CaptureError: fewer than two cameras see anybody in the first frame, or no pose explains what they see.
     """
     if pose is not None:
-        return _follow(finder, seen, _searched(finder, seen[0], pose)[None], 0)
+        return _follow(finder, seen, finder.improved(seen[0], pose)[None], 0)
     skeleton = finder.body.skeleton
     hypotheses: list[TrajectoryHypothesis] = []
-    alternatives: list[tuple[int, int, Float, float]] = []  # rank in its anchor, anchor, pose, prior in nats
-    clear: list[tuple[int, Float, float]] = []  # anchor, pose, prior
+    alternatives: list[tuple[int, int, Float]] = []  # rank in its anchor, anchor, pose
+    clear: list[tuple[int, Float]] = []  # anchor, pose
     least = np.inf
     for anchor in np.unique(np.linspace(0, len(seen) - 1, ANCHORS).astype(int)):
         try:
@@ -84,15 +72,13 @@ def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None 
                 raise
             continue
         least = min(least, residual)
-        if residual > EXPLAINS_NOTHING:
+        if residual > finder.contours.lost_error:
             continue
-        turned = np.cos(poses[:, skeleton.index("torso_yaw")] - poses[0, skeleton.index("torso_yaw")]) < 0
-        for rank, pose in enumerate(poses[1:]):
-            alternatives.append((rank, int(anchor), pose, 0.0 if turned[1 + rank] else EXCHANGE))
+        alternatives += [(rank, int(anchor), pose) for rank, pose in enumerate(poses[1:])]
         if _contains(skeleton, hypotheses, anchor, poses[0]):
             break  # found from two frames
         if residual < CLEAR and not hypotheses:
-            clear = [(int(anchor), poses[0], 0.0)]  # followed with its alternatives: no other anchor is needed
+            clear = [(int(anchor), poses[0])]  # followed with its alternatives: no other anchor is needed
             break
         hypotheses += _follow(finder, seen, poses[:1], anchor)
         if residual < CLEAR:
@@ -104,15 +90,14 @@ def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None 
         )
     likeliest = sorted(range(len(alternatives)), key=lambda i: alternatives[i][0])[:FOLLOWED]
     for anchor, group in groupby([*clear, *(alternatives[i][1:] for i in sorted(likeliest))], itemgetter(0)):
-        new = [(pose, prior) for _, pose, prior in group if not _contains(skeleton, hypotheses, anchor, pose)]
-        followed = _follow(finder, seen, [pose for pose, _ in new], anchor)
-        hypotheses += [one._replace(cost=one.cost + prior) for one, (_, prior) in zip(followed, new, strict=True)]
+        new = [pose for _, pose in group if not _contains(skeleton, hypotheses, anchor, pose)]
+        hypotheses += _follow(finder, seen, new, anchor)
     hypotheses.sort(key=lambda hypothesis: hypothesis.cost)
     kept: list[TrajectoryHypothesis] = []
     for hypothesis in hypotheses:
         joints = skeleton.joints(hypothesis.poses)
         apart = [np.max(skeleton.apart(other.poses, joints)) for other in kept]
-        if hypothesis.cost <= hypotheses[0].cost + DROPPED and all(distance > SAME_START_M for distance in apart):
+        if hypothesis.cost <= hypotheses[0].cost + DROPPED and all(distance > DISTINCT_M for distance in apart):
             kept.append(hypothesis)
     return kept
 
@@ -120,7 +105,7 @@ def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None 
 def _contains(skeleton: Skeleton, hypotheses: Sequence[TrajectoryHypothesis], frame: int, pose: Float) -> bool:
     """Return whether one of the hypotheses has the pose (D,) in a frame."""
     joints = skeleton.joints(pose)
-    return any(skeleton.apart(hypothesis.poses[frame], joints) < SAME_START_M for hypothesis in hypotheses)
+    return any(skeleton.apart(hypothesis.poses[frame], joints) < DISTINCT_M for hypothesis in hypotheses)
 
 
 def _find(finder: ContourFinder, seen: Seen) -> tuple[float, Float]:
@@ -130,12 +115,12 @@ def _find(finder: ContourFinder, seen: Seen) -> tuple[float, Float]:
     found = np.concatenate([anywhere.propose(finder, seen), landmarks.propose(finder, seen)])
     both = [opposite.propose(finder, seen, pose, range(finder.solver.scales)[::-1]) for pose in found[:OPPOSITE]]
     found = np.concatenate([found, *both])
-    found = found[different(skeleton, found, SAME_START_M)]
-    poses = np.array([_searched(finder, seen, pose) for pose in found])
+    found = found[different(skeleton, found, DISTINCT_M)]
+    poses = np.array([finder.improved(seen, pose) for pose in found])
     cost = seen.evidence.cost(finder.body, poses)
     order = np.argsort(cost, kind="stable")
     kept = poses[order[cost[order] < cost.min() + DROPPED]]
-    kept = kept[different(skeleton, kept, SAME_START_M)]
+    kept = kept[different(skeleton, kept, DISTINCT_M)]
     return float(finder.mean_residual(seen.pyramid, kept[:1], seen.frame.uncertain)[0]), kept
 
 
@@ -147,12 +132,7 @@ def _follow(
         return []
     F, skeleton = len(seen), finder.body.skeleton
     poses = np.tile(np.array(starts)[:, None], (1, F, 1))
-    residuals, costs = np.full((2, len(starts), F), np.nan)
-
-    def residual_of(i: int, poses: Float) -> Float:
-        return finder.mean_residual(seen[i].pyramid, poses, seen[i].frame.uncertain)
-
-    residuals[:, anchor] = residual_of(anchor, poses[:, anchor])
+    costs = np.full((len(starts), F), np.nan)
     costs[:, anchor] = seen[anchor].evidence.cost(finder.body, poses[:, anchor])
     every = finder.search_frames
     for step, end in ((1, F), (-1, -1)):
@@ -160,30 +140,18 @@ def _follow(
             last = poses[:, i - step]
             before = poses[:, i - 2 * step] if abs(i - anchor) > 1 else poses[:, anchor]
             now = finder.settle(seen[i].pyramid, last + finder.contours.prediction * (last - before)).states
-            residual = residual_of(i, now)
-            if not np.isfinite(residual).any():  # no camera sees anybody
+            cost = seen[i].evidence.cost(finder.body, now)
+            if not np.isfinite(cost).any():  # no camera sees anybody
                 poses[:, i] = last
                 continue
-            high = residual > WORSE * residuals[:, anchor]
             means = np.nanmean(costs, axis=1)  # no search brings back a trajectory that is worse by far
-            searched = (high | (abs(i - anchor) % every == 0)) & (means <= means.min() + DROPPED) if every else []
+            searched = (abs(i - anchor) % every == 0) & (means <= means.min() + DROPPED) if every else []
             for b in np.flatnonzero(searched):
                 now[b] = finder.improved(seen[i], now[b])
-                residual[b] = residual_of(i, now[b : b + 1])[0]
-            poses[:, i], residuals[:, i] = now, residual
-            costs[:, i] = seen[i].evidence.cost(finder.body, now)
+                cost[b] = seen[i].evidence.cost(finder.body, now[b : b + 1])[0]
+            poses[:, i], costs[:, i] = now, cost
     means = np.nanmean(costs, axis=1) + walking(skeleton, poses)
     return [TrajectoryHypothesis(one, float(mean)) for one, mean in zip(poses, means, strict=True)]
-
-
-def _searched(finder: ContourFinder, seen: Seen, pose: Float) -> Float:
-    """Return the pose (D,) after limb searches, repeated as long as a search finds a better pose."""
-    for _ in range(_SEARCHES):
-        found = finder.improved(seen, pose)
-        if np.array_equal(found, pose):
-            break
-        pose = found
-    return pose
 
 
 def stature_of(finder: ContourFinder, pyramids: Sequence[Pyramid]) -> float:

@@ -36,19 +36,20 @@ from tk.io.results.status import Status
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import determine_depth
+from tk.model.cues.part_colors import RATE
 from tk.model.masks.image_health import IMAGE_FAULTS
 from tk.model.stateful import Stateful
 from tk.trackers.protocol import Estimate, Tracker, sharing
 from tk.trackers.reason import Reason, is_lost
-from tk.trackers.residual import LEVEL, OUTLIER, RATE, RECENT, displacement, level_spread
+from tk.trackers.residual import LEVEL, LEVEL_SPREAD, OUTLIER, RECENT, displacement
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-# Keeps the logarithm finite where a body fits perfectly; a hundredth of the level.
-_TINY = 1e-3
-# Sigma is unknown after this many consecutive frames with a high residual, and two failed searches for the person.
-UNKNOWN_AFTER = 6
+# Frames between two searches for a lost person; a residual that stays high starts them after 1, 2, 4 … times as many.
+RECOVER_EVERY = 3
+# Sigma is unknown after this many consecutive frames with a high residual: two searches have failed.
+UNKNOWN_AFTER = 2 * RECOVER_EVERY
 # Highest speed of the trunk, m/s: a sprinter reaches 12; and an error of its position between frames, metres.
 FASTEST_M_S, TRUNK_ERROR_M = 12.0, 0.2
 _TRUNK = JOINTS.index("pelvis"), JOINTS.index("neck")
@@ -74,16 +75,12 @@ _CERTAIN = np.array([False, *(fault.certain for fault in FAULTS.values())])
 STATE_MEANINGS = ("0: used", *(f"{value}: {fault.text}" for value, fault in enumerate(FAULTS.values(), 1)))
 
 # A camera becomes wrong once in eleven minutes, a mask poor once in half a minute; both last five seconds. These rates
-# are assumed, and so are the shares below. With half and twice of each of _POOR_HZ, _TORN and _PIECE, and with _WHOLE
-# from 0.25 to 0.75, the mean errors of a recording with a carried object change by 0.02 cm, another's not at all.
+# are assumed, and so are the shares below.
 _BEGIN_HZ, _END_HZ, _POOR_HZ = 0.0015, 0.2, 0.03
-# Least probability of a state.
-_LEAST = 1e-9
 # Wrong poses a second, whatever the cameras are.
 _LOSE_HZ = 0.3
-# Of the frames with a poor mask: the share in which it misses nothing, and in which it shows nothing else; the share in
-# which it misleads. The mean size of a piece, as a share of the person's pixels.
-_WHOLE, _TORN, _PIECE = 0.5, 0.05, 0.15
+# Share of the frames with a poor mask in which it misleads. Mean size of a piece, as a share of the person's pixels.
+_TORN, _PIECE = 0.05, 0.15
 
 
 def likelihoods(excess: Float, spread: Float) -> Float:
@@ -98,7 +95,7 @@ def likelihoods(excess: Float, spread: Float) -> Float:
     normal = -(over**2) / 2 - np.log(2 * np.pi) / 2
     anything = np.log(spread)[:, None]
     pieces = anything - np.log(_PIECE) - over * spread[:, None] / _PIECE
-    poor = np.logaddexp(np.log(_WHOLE) + normal, np.log1p(-_WHOLE) + pieces).sum(axis=1)
+    poor = (np.logaddexp(normal, pieces) - np.log(2.0)).sum(axis=1)  # an area is normal or not, equally likely
     found = np.stack([normal.sum(axis=1), poor, 2 * anything[:, 0]], axis=1)
     return np.where(np.isfinite(excess[:, :1]), found, 0.0)
 
@@ -201,7 +198,7 @@ class Cameras(Stateful[Belief]):
 
     def _expected(self) -> Float:
         """Return (C, 3) logarithms of the probabilities of the states, before the frame's masks are seen."""
-        return np.asarray(np.log(np.maximum(self._probability[:, :3] @ self._transition, _LEAST)))
+        return np.asarray(np.log(np.maximum(self._probability[:, :3] @ self._transition, np.finfo(np.float64).tiny)))
 
     def _marginal(self, likelihood: Float, cameras: Bool) -> float:
         """Return the logarithm of the likelihood of cameras (C,) in unknown states, from those (C, 3) of each state."""
@@ -336,13 +333,13 @@ def _contradicted(residual: Float, false_alarm: float) -> Bool:
     Half of the logarithm's variance lies between recordings, so all frames of a recording with a high level would count
     as contradicted. The limit is therefore set for the probability ``false_alarm`` squared.
     """
-    log = np.log(displacement(residual) + _TINY)
-    measured = np.flatnonzero(np.isfinite(log))
+    away = displacement(residual)
+    measured = np.flatnonzero(np.isfinite(away))
     result = np.zeros(len(residual), np.bool_)
     if len(measured):
         window = min(RECENT, len(measured))
-        mean = np.convolve(log[measured], np.full(window, 1.0 / window), "valid")
-        limit = np.log(LEVEL) - level_spread(window) * NormalDist().inv_cdf(false_alarm**2)
+        mean = np.convolve(away[measured], np.full(window, 1.0 / window), "valid")
+        limit = LEVEL * np.exp(-LEVEL_SPREAD * NormalDist().inv_cdf(false_alarm**2))
         for first in np.flatnonzero(mean > limit):
             result[measured[first : first + window]] = True
     return result

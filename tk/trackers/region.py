@@ -43,14 +43,12 @@ from tk.model.masks.regions import SQUARE3
 from tk.model.masks.silhouettes import Pyramid
 from tk.model.reduced_images import crop
 from tk.model.setup import Setup, Subject
-from tk.optim.gauss_newton import GaussNewtonSettings
 from tk.optim.quadratic import Quadratic
 from tk.settings import RegionSettings, Settings, SilhouetteSettings
 from tk.trackers.contour_finder import INFORMATION, Seen
-from tk.trackers.contour_tracker import RECOVER_EVERY, ContourTracker
+from tk.trackers.contour_tracker import ContourTracker
 from tk.trackers.hypotheses import (
     DROPPED,
-    PATIENCE,
     PROPOSED,
     RENEWAL,
     SAME_POSE_M,
@@ -58,7 +56,7 @@ from tk.trackers.hypotheses import (
     disagreement,
     walking,
 )
-from tk.trackers.judgement import Match, depth_known
+from tk.trackers.judgement import RECOVER_EVERY, Match, depth_known
 from tk.trackers.proposals import exchanged, limbs
 from tk.trackers.proposals import landmarks as of_landmarks
 from tk.trackers.proposals import opposite as of_heading
@@ -69,34 +67,13 @@ from tk.trackers.second_pass import STATURE, SecondPass
 
 Float = NDArray[np.float64]
 
-# Frames over which the mean posture is a plain mean; then the oldest are forgotten.
-_POSTURE_FRAMES = 200
-
-# Scales of a frame, at least: from the finest alone Gauss-Newton does not converge.
-FEWEST = 2
-# Rate up to which a frame has all iterations, Hz. With one over-relaxed iteration a scale at 15 Hz, no mean error of
-# walk, dance, fold and cube changes by 0.03 cm, but colours locate a hidden forearm less exactly from two views.
-FULL_HZ = 15.0
-# Share of the finest scale's reach within which a single iteration a scale is a plain one. With 1 instead of 0.25 the
-# limbs of fold and cube, with a single iteration at 15 Hz, are 0.08 cm worse.
-PLAIN = 0.25
-# Standard deviations of the priors about the predicted pose (tk.model.body.joints has those about zero). Chosen on the
-# development captures; half and twice the value change the mean errors of dance and cube (50 frames) by 0.04 cm at
-# most (angle) and 0.01 cm (translation).
+# Standard deviations of the priors about the predicted pose (tk.model.body.joints has those about zero).
 ANGLE_DEG, TRANSLATION_M = 40.0, 0.3
-# Masks are searched for carried objects if this share of their pixels has colours that are not the person's; objects
-# narrower than six pixels are ignored.
-FOREIGN_SHARE = 0.01
-# A limb is misplaced if the mean mismatch of its rays is larger. In the development captures no limb within 15 cm of
-# the ground truth has 0.25, and most others have 0.3 to 0.4.
+# A limb is misplaced if the mean mismatch of its rays is larger.
 MISPLACED = 0.25
 # Limbs are searched for in every second frame if this share of the body's rays meets pixels of other people: a hidden
-# limb has no contour to follow, and appears elsewhere. With 0.1 and 0.2 the limbs of seven people in four rendered
-# scenes are on average 0.3 and 0.4 cm worse; a search in every frame changes the mean of 13 people by 0.1 cm. Where the
-# pose explains the frame as well as others, nothing can be found: the residual must be DOUBTFUL spreads above its
-# mean. 62 of 142 searches in four scenes are below, and 3 of the 21 that changed a limb by more than 0.3 cm. Without a
-# limit, with 0.5 and with 1 the limbs of twelve people are 1.58, 1.57 and 1.54 cm off on average; with 1, those of one
-# of two people who circle each other before four cameras without an empty scene are 0.5 cm worse.
+# limb has no contour to follow, and appears elsewhere. Where the pose explains the frame as well as others, nothing can
+# be found: the residual must be DOUBTFUL spreads above its mean.
 HIDDEN, SEARCH_HIDDEN, DOUBTFUL = 0.02, 2, 0.5
 
 
@@ -250,8 +227,8 @@ class RegionTracker(ContourTracker[RegionState]):
         # predict, settle
         self._alive += [replace(h, previous=h.pose, jumped=False) for h in self._alive if h.jumped]
         starts = np.array([h.pose + contours.prediction * (h.pose - h.previous) for h in self._alive])
-        levels, solver = self._iterations()
-        poses, _, iterations = self.settle(pyramid, starts, levels, seen.images, self.prior(starts), solver=solver)
+        prior = self.prior(starts)
+        poses, _, iterations = self.settle(pyramid, starts, self._scales(), seen.images, prior)
         watch.lap("optimise")
         mismatch, met = evidence.cast(self.body, poses)
         if not np.isfinite(mismatch).all():
@@ -333,17 +310,14 @@ class RegionTracker(ContourTracker[RegionState]):
         person = grid.sample(frame.masks) >= PERSON
         unknown = foreign[color_bins(grid.sample(frame.images)[person])]
         view = np.nonzero(person)[0]
-        seen, odd = (np.bincount(of, minlength=len(person)) for of in (view, view[unknown]))
-        if odd.sum() < FOREIGN_SHARE * seen.sum():
-            return frame
         masks, uncertain = frame.masks, np.zeros(0, np.bool_)
-        for c in np.flatnonzero(odd >= FOREIGN_SHARE * np.maximum(seen, 1)):
+        for c in np.unique(view[unknown]):
             # one ray more on each side: the mask ends between two rays
             box = tuple(
                 slice(max(rays[0] - 1, 0) * grid.step, (rays[-1] + 2) * grid.step)
                 for rays in (np.flatnonzero(person[c].any(axis=axis)) for axis in (1, 0))
             )
-            # a quarter of the pixels shows objects of this size
+            # a quarter of the pixels shows objects that are wider than six pixels; narrower ones are ignored
             coarse = crop(frame.images[c], masks.shape[1:], *box)[::2, ::2]
             odd_pixels = foreign[color_bins(coarse)] & (masks[c][box][::2, ::2] >= PERSON)
             opened = np.asarray(cv2.morphologyEx(odd_pixels.view(np.uint8), cv2.MORPH_OPEN, SQUARE3), np.uint8)
@@ -365,13 +339,12 @@ class RegionTracker(ContourTracker[RegionState]):
     def last_poses(self) -> tuple[Float, Float]:
         return self._best.pose, self._best.previous
 
-    def _iterations(self) -> tuple[list[int], GaussNewtonSettings]:
-        """Return the scales of the next frame, coarse to fine, and the iterations at each.
+    def _scales(self) -> list[int]:
+        """Return the scales of the next frame, coarse to fine.
 
         A coarse scale reaches far, but also other limbs' edges. So the first is the finest that reaches as far as a
-        joint may be from its prediction: its last step times the unpredicted share. After a jump, a loss or a high
-        residual it is the coarsest. If the finest scale reaches so far, a frame continues where the last one ended:
-        at higher rates than :data:`FULL_HZ` it has fewer iterations, so that their number a second is the same.
+        joint may be from its prediction: its last step times the unpredicted share; from the finest of all alone
+        Gauss-Newton does not converge. After a jump, a loss or a high residual it is the coarsest.
         """
         contours, skeleton, solver = self.contours, self.body.skeleton, self.solver
         first, window_px = solver.scales - 1, self.line_search.window_px
@@ -379,13 +352,9 @@ class RegionTracker(ContourTracker[RegionState]):
             step_m = max(skeleton.apart(h.pose, skeleton.joints(h.previous)) for h in self._alive)
             error_m = abs(1 - contours.prediction) * step_m
             error_px = error_m * self.views.rig.pixels_per_metre(skeleton.joints(self._best.pose)[0])
-            while first > FEWEST - 1 and window_px * 2 ** (first - 1) >= error_px:
+            while first > self.search_level and window_px * 2 ** (first - 1) >= error_px:
                 first -= 1
-            if error_px <= window_px:
-                fewer = max(round(solver.iterations * min(FULL_HZ / self.fps, 1.0)), 1)
-                plain = fewer == 1 and error_px <= PLAIN * window_px
-                solver = replace(solver, iterations=fewer, relaxation=1.0 if plain else solver.relaxation)
-        return list(range(first, -1, -1)), solver
+        return list(range(first, -1, -1))
 
     def prior(self, mean: Float, angle_deg: float = ANGLE_DEG) -> Quadratic:
         """Return the prior: straight joints about zero, all other degrees of freedom about ``mean`` (..., D)."""
@@ -396,7 +365,7 @@ class RegionTracker(ContourTracker[RegionState]):
         return Quadratic.about(np.where(straight, 0.0, mean), deviation**-2 / INFORMATION)
 
     def _rank(self) -> None:
-        """Sort the hypotheses by cost; drop those that are improbable beside the best, too old or equal."""
+        """Sort the hypotheses by cost; drop those that are improbable beside the best, or equal."""
         if len(self._alive) == 1:
             self._alive = [replace(self._alive[0], age=1)]
             return
@@ -404,7 +373,7 @@ class RegionTracker(ContourTracker[RegionState]):
         kept: list[Hypothesis] = []
         joints: list[Float] = []
         for h in sorted(self._alive, key=lambda h: h.cost):
-            if kept and (h.cost > kept[0].cost + DROPPED or h.age > PATIENCE):
+            if kept and h.cost > kept[0].cost + DROPPED:
                 continue
             if all(skeleton.apart(h.pose, other) > SAME_POSE_M for other in joints):
                 kept.append(h)
@@ -471,7 +440,7 @@ class RegionTracker(ContourTracker[RegionState]):
         prior = self.prior(pose[None])
         hessian, _ = self.equations(seen.pyramid, pose[None], prior, self.view_m, seen.images)
         variance = self.variance(pose, np.linalg.inv(hessian[0]), look.residual)
-        self._postures = min(self._postures + 1, _POSTURE_FRAMES)
+        self._postures += 1
         self._mean_posture += (directions(skeleton, pose) - self._mean_posture) / self._postures
         variance += posture_variance(skeleton, pose, self._mean_posture) + self._spread
         variance += self.contradiction(seen.pyramid, pose[None])[0]

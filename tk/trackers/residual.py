@@ -17,33 +17,19 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.model.cues.part_colors import RATE
 from tk.model.stateful import Stateful
 
 Float = NDArray[np.float64]
 
-# Spread of a residual in a view at the start, and the least that is assumed: absolute, and as a share of the mean.
-# Measured over all views of walk, dance, fold, cube and treadmill-slow: 0.02 to 0.042, median 0.028; 0.2 to 0.5 of the
-# mean.
-START_SPREAD, LEAST_SPREAD, LEAST_SHARE = 0.03, 0.02, 0.2
-# Share of mean and spread that a frame replaces: they follow a change of light or clothes within about 20 frames. The
-# mean of the first frames is a plain mean. With half and twice the value the mean errors of dance and cube (60 frames)
-# change by 0.06 cm at most.
-RATE = 0.05
-# An excess above this in one view, in spreads, is an outlier. The mean over the views counts it as this value, so
-# that a torn mask in one of three or more views makes no frame's residual high. In 2 % of the frames of the development
-# captures a view has a larger excess.
+# Spread of a residual in a view at the start, and the least that is assumed: median of recordings, share of the person.
+LEAST_SPREAD = 0.028
+# An excess above this in one view, in spreads, is an outlier. The mean over the views counts it as this value, so that
+# a torn mask in one of three or more views makes no frame's residual high.
 OUTLIER = 5.0
-# Displacement in the mean over the views: mean in correct recordings, standard deviation of its logarithm in one frame
-# and over RECENT frames (0.20 of it lies between recordings), and this number of frames. Measured on walk, dance, fold,
-# cube, treadmill-slow, rig9, hd and sixteen with all, three and two cameras, in 2600 frames less than 6 cm off: 0.065
-# to 0.126 in the median of a recording, at most 0.20 over RECENT frames. Another recording's calibration gives 0.25 to
-# 0.6; two of five cameras turned by 3 degrees give 0.15 to 0.6.
-LEVEL, LEVEL_SPREADS, RECENT = 0.091, (0.30, 0.264), 5
-
-
-def level_spread(frames: int) -> float:
-    """Return the standard deviation of the logarithm of the displacement, mean over 1 to :data:`RECENT` frames."""
-    return float(np.interp(frames, (1, RECENT), LEVEL_SPREADS))
+# Displacement in the mean over the views: mean in correct recordings, standard deviation of its logarithm (most of it
+# lies between recordings), and the frames that are judged together.
+LEVEL, LEVEL_SPREAD, RECENT = 0.091, 0.28, 5
 
 
 def displacements(residual: Float) -> Float:
@@ -95,7 +81,7 @@ class ResidualBaseline(Stateful[BaselineState]):
 
     def __init__(self, views: int, false_alarm: float) -> None:
         self.threshold = NormalDist().inv_cdf(1.0 - false_alarm)
-        self.mean, self.spread = np.full((views, 2), np.nan), np.full(views, START_SPREAD)
+        self.mean, self.spread = np.full((views, 2), np.nan), np.full(views, LEAST_SPREAD)
         self._frames = np.zeros(views, np.int64)  # without a high residual, by view
 
     def excess(self, error: Float) -> Float:
@@ -134,8 +120,8 @@ class ResidualBaseline(Stateful[BaselineState]):
         return bool(seen.any() and (excess[seen] > OUTLIER).all())
 
     def learn(self, residual: Float) -> None:
-        """Update the baseline with a frame's residual (V, 2). E_S counts as one spread above the mean at most, so that
-        a wrong pose does not become the baseline soon."""
+        """Update the baseline with a frame's residual (V, 2); the mean of the first frames is a plain mean. E_S counts
+        as one spread above the mean at most, so that a wrong pose does not become the baseline soon."""
         error = residual.sum(axis=1)
         seen = np.isfinite(error)
         mean = self._means(residual)
@@ -148,8 +134,7 @@ class ResidualBaseline(Stateful[BaselineState]):
         self._frames = self._frames + right
         mean = mean + rate[:, None] * deviation
         # a high residual is no sample of what is normal; it would widen the spread until it counts as normal itself.
-        # 1.25: the mean absolute deviation of a normal variable is 0.8 standard deviations
-        spread = self.spread + RATE * (1.25 * np.abs(np.minimum(rise, self.spread)) - self.spread)
-        least = np.maximum(LEAST_SPREAD, LEAST_SHARE * mean.sum(axis=1))
+        # the mean absolute deviation of a normal variable is √(2/π) standard deviations
+        spread = self.spread + RATE * (np.sqrt(np.pi / 2) * np.abs(np.minimum(rise, self.spread)) - self.spread)
         self.mean = np.where(seen[:, None], mean, self.mean)
-        self.spread = np.where(right, np.maximum(spread, least), self.spread)
+        self.spread = np.where(right, np.maximum(spread, LEAST_SPREAD), self.spread)

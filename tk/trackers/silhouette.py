@@ -22,8 +22,8 @@ from tk.model.setup import Setup, Subject
 from tk.optim.gauss_newton import GaussNewtonSettings
 from tk.settings import Settings, SilhouetteSettings
 from tk.trackers.contour_finder import LINE_SEARCH, SOLVER, blind
-from tk.trackers.contour_tracker import RECOVER_EVERY, ContourTracker
-from tk.trackers.judgement import Match
+from tk.trackers.contour_tracker import ContourTracker
+from tk.trackers.judgement import RECOVER_EVERY, Match
 from tk.trackers.protocol import Estimate, Frame, Stopwatch
 from tk.trackers.reason import is_lost
 

@@ -52,12 +52,10 @@ Float = NDArray[np.float64]
 CELL_VOXELS = 4.0
 # Minimum number of surface voxels of a person: a person has about 1,300 in a grid of 64³. Smaller hulls are noise.
 LEAST_VOXELS = 60
-# Status "lost": more than this share of the samples of a limb, the head or the torso has no voxel within σ. Half and
-# twice the value change nothing on walk and dance, where nothing is lost.
+# Status "lost": more than this share of the samples of a limb, the head or the torso has no voxel within σ.
 LOST_SHARE = 0.6
 # Shares of the last frame's motion that are tried as predictions for the next one. The paper does not say how it
-# predicts; at 15 Hz an arm turns by up to 31° between frames (its section 7.4). With half of them the mean errors of
-# five captures (45 frames) change by 0.01 cm.
+# predicts; at 15 Hz an arm turns by up to 31° between frames (its section 7.4).
 PREDICTIONS = (1.0, 0.5, 0.0)
 
 

@@ -12,7 +12,7 @@ from tk.model.body.cone_body import COLOR_GROUPS
 from tk.model.body.gait_poses import walking_pose
 from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import PartColors
-from tk.model.cues.ray_costs import COLOR_COST, UNCERTAIN_COST, Evidence, RayGrid, mean_of_views
+from tk.model.cues.ray_costs import UNCERTAIN_COST, Evidence, RayGrid, mean_of_views
 from tk.model.masks.silhouettes import share_wrong
 
 RIG = ring_of_cameras(3, width=120, height=160)
@@ -101,7 +101,7 @@ def test_color_of_another_part_costs():
     swapped[is_arm], swapped[is_trunk] = NAMES.index("chest") + 1, NAMES.index("forearm_l") + 1
     wrong = by_view(Evidence.of(FINE, MASKS, None, lookup[swapped], colors), POSES[:1])
     share = (is_arm | is_trunk).sum(axis=(1, 2)) / (MASKS > 0).sum(axis=(1, 2))
-    np.testing.assert_allclose(wrong[0], COLOR_COST * share, rtol=0.1)
+    np.testing.assert_allclose(wrong[0], UNCERTAIN_COST * share, rtol=0.1)
     # no pictures, no colours
     assert Evidence.of(FINE, MASKS, None, images[:0], colors).bins is None
 

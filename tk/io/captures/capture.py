@@ -40,9 +40,7 @@ __all__ = ["Capture", "FrameReader", "FrameSet", "open_capture"]
 DEFAULT_FPS = 30.0
 
 # Most images of the empty scene for each camera, the first of a clip; most recorded pixels and most bytes of all of
-# them, but at least so many images. Decoding more delays the first pose. With 16 or 25 the errors on walk, dance, fold,
-# cube, treadmill-slow, hd and rig9 differ by at most 0.04 cm, on hd and sixteen with 8 or 25 by at most 0.02 cm, but
-# with 16 the masks of three cameras of 160x120 contradict each other.
+# them, but at least so many images. Decoding more delays the first pose.
 _BACKGROUND_FRAMES, _LEAST_BACKGROUND = 32, 8
 _BACKGROUND_PIXELS, _BACKGROUND_BYTES = 50_000_000, 400_000_000
 

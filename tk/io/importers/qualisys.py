@@ -31,7 +31,7 @@ _LEAST_SUBPIXELS = 12_800
 #: bytes of a file in which its first camera is named
 _HEAD_BYTES = 4096
 
-#: ways to read <transform>, QTM's first
+#: readings of <transform>, QTM's first
 _READINGS = {
     "x y z is a camera's centre, its y axis points up": y_up(placed),
     "x y z is a translation, the camera's y axis points up": y_up(to_camera),

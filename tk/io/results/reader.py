@@ -191,7 +191,7 @@ class StoredPerson:
         self._offsets = self._read_offsets()
 
     def _refuse_copies(self) -> None:
-        """Refuse data in the place of a link to person 0: another program has changed them, and tk would not see it."""
+        """Refuse data instead of a link to person 0: another program has changed them, and tk would not see it."""
         own = {name.split("/")[0] for name, column in self._columns.items() if not column.entry.of_run}
         for path in (*self._file.groups, *self._file.shapes):
             if (name := path.split("/")[0]) in own | {"model", "smoothed", "hull"}:

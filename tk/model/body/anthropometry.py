@@ -52,10 +52,7 @@ UPRIGHT = ("head", "trunk", "thigh", "calf", "ankle_height")
 # up by 5 to 10° more (Ludewig et al., J. Bone Joint Surg. Am. 91, 2009, 378-389), 2 to 3 cm at its end.
 RAISED_SHOULDERS = 0.016
 
-# Where the surface lies off the lines between joint centres, as fractions of the stature. Neither source gives these:
-# estimates, chosen with the joints of the rendered development captures in view. With half and twice the value, the
-# mean errors of walk (32 frames) change by less than 0.1 cm, except half of KNEE_BACK and of ANKLE_OUTWARD, 0.12 and
-# 0.11 cm more, and half and twice of PELVIS_FORWARD, 0.2 and 0.4 cm more.
+# Where the surface lies off the lines between joint centres, as fractions of the stature.
 CROTCH_DROP = 0.070  # lowest point of the trunk below the hip centres, in trousers
 PELVIS_FORWARD = 0.016  # middle of the pelvis in front of the line from the hip centres to C7/T1
 KNEE_BACK = 0.007  # middle of the knee behind the line from hip to ankle: its hollow and the calf's muscle

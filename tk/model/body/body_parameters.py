@@ -26,8 +26,7 @@ Float = NDArray[np.float64]
 # Prior standard deviation of a dimension's logarithm about the proportions of the stature. Lengths between joints vary
 # by 4 to 5 % at a given stature (Drillis & Contini 1966); definitions of the shoulder's centre differ by more.
 # Fingers may be bent. Radii vary with girth and clothes; so do the ends of the body and the shoulder's drop, which both
-# sources define loosely. Mean errors of walk and dance (60 frames) change by less than 0.1 cm with radii of half and
-# twice the value and with half the values of the lengths; twice these costs 0.3 cm.
+# sources define loosely.
 _LENGTHS = (
     dict.fromkeys(("trunk", "head", "forearm", "thigh", "calf"), 0.05)
     | dict.fromkeys(("foot", "shoulder_half_width", "hip_half_width"), 0.06)
@@ -38,8 +37,7 @@ _RADII = 0.2
 # Prior standard deviation of a part's shape: logarithms of a, b, m and h about the values that follow from the
 # dimensions, and metres off the bone along x and y at the beginning and at the end of the axis. Parts between joints
 # keep their lengths. Hands, feet and head end a chain, so their lengths and directions are free. Parts in the median
-# plane are symmetric. Half and twice the values of limbs, trunk, head or ends change the mean errors of dance and cube
-# (50 frames) by 0.05 cm at most, those of walk and dance (60 frames, limbs) by less than 0.1 cm.
+# plane are symmetric.
 _FIXED = 1e-6
 _WIDTHS = 3 * (0.15,)
 _LIMB = (*_WIDTHS, _FIXED, *4 * (0.005,))

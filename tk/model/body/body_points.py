@@ -22,9 +22,8 @@ Float = NDArray[np.float64]
 # 0.006, 0.043) (ANSUR II survey, Gordon et al. 2014, means of men and women).
 _FACE = {"nose": (0.078, 0.074, 0.0), "eye": (0.063, 0.054, 0.016), "ear": (0.077, 0.024, 0.031)}
 
-# Where MediaPipe's network marks a joint, off the joint's centre: forward, outward, up, shares of the stature. Medians
-# of triangulated landmarks in walk, dance and fold and of two people before markers: hips 2 to 4 cm forward and 0 to 5
-# cm down, shoulders 1 to 2 cm inward, ankles 1 to 2 cm forward and 0 to 5 cm up. Of other joints they are within 2 cm.
+# Where MediaPipe's network marks a joint, off the joint's centre: forward, outward, up, shares of the stature. Of other
+# joints they are within 2 cm.
 _MARKED = {"hip": (0.017, 0.0, -0.019), "shoulder": (0.004, -0.009, 0.006), "ankle": (0.007, 0.0, 0.010)}
 # Heel and toe in front of the ankle's centre, shares of the foot's length: as in tk.model.body.cone_body.
 _HEEL, _TOE = -0.2, 0.8

@@ -22,8 +22,7 @@ from tk.model.body.joints import ROWS
 Float = NDArray[np.float64]
 
 # Mean error divided by the expected one: 90 % prediction interval of a further recording (Student, of the logarithms)
-# for the mean of all joints, and 5 to 95 % for a single joint's mean. From `python -m scripts.joint_offsets` on the
-# recordings that docs/evaluation.md lists; punch, kick and wash are not among them.
+# for the mean of all joints, and 5 to 95 % for a single joint's mean.
 _ALL_JOINTS = np.array([0.54, 1.73])
 _ONE_JOINT = np.array([0.48, 2.40])
 #: squared mean length of a normal vector with standard deviation 1 along each axis.

@@ -21,13 +21,13 @@ Float = NDArray[np.float64]
 LEAST_STATURE, GREATEST_STATURE = 0.8, 2.4
 # Standard deviation of a written joint, metres.
 _JOINT_M = 0.02
-# Standard deviation of an angle about that of standing, radians: wide, for what the joints leave open.
-_ANGLE = 5.0
 # Precision that holds an angle at its limit: 0.003 rad, small against a joint's noise over a limb's length.
 _LIMIT = 1e5
-# Headings to begin from, and iterations for each with steps of at most this size, radians: enough to turn any joint
-# from one limit to the other.
-_HEADINGS, _ITERATIONS, _LONGEST_STEP = 8, 30, 0.4
+# Headings from which a person of unknown pose is searched for.
+HEADINGS = 8
+# Iterations from each heading with steps of at most this size, radians: enough to turn any joint from one limit to the
+# other.
+_ITERATIONS, _LONGEST_STEP = 30, 0.4
 
 
 def rough_pose(
@@ -64,7 +64,7 @@ def pose_of_joints(skeleton: Skeleton, rows: NDArray[np.int64], targets: Float) 
     start = figures(skeleton, np.zeros(3))
     start[:, :3] += targets.mean(axis=0) - skeleton.joints(start[0])[rows].mean(axis=0)
     D = start.shape[1]
-    precision = np.where(skeleton.prismatic, 0.0, _ANGLE**-2.0)
+    precision = np.where(skeleton.prismatic, 0.0, np.pi**-2.0)  # half a turn, for what the joints leave open
     weight = np.full(3 * len(rows), _JOINT_M**-2.0)
 
     def linearise(poses: Float, _: int) -> Equations:
@@ -96,8 +96,8 @@ def figures(skeleton: Skeleton, p_pelvis: Float) -> Float:
     seated = rest.copy()  # from a straight leg a folded one is not reached
     for hip, knee in zip(HIPS, (LIMBS[leg][1] for leg in ("leg_l", "leg_r")), strict=True):
         seated[skeleton.index(f"{hip}_pitch")], seated[skeleton.index(f"{knee}_flexion")] = -np.pi / 2, np.pi / 2
-    poses = np.repeat(np.stack([rest, seated]), _HEADINGS, 0)
-    poses[:, skeleton.index("torso_yaw")] = np.tile(np.arange(_HEADINGS) * 2 * np.pi / _HEADINGS, 2)
+    poses = np.repeat(np.stack([rest, seated]), HEADINGS, 0)
+    poses[:, skeleton.index("torso_yaw")] = np.tile(np.arange(HEADINGS) * 2 * np.pi / HEADINGS, 2)
     poses[:, :3] = p_pelvis
     return poses
 

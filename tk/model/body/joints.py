@@ -122,12 +122,10 @@ def _neck(d: BodyDimensions) -> Float:
 # the chest. Ankle: Boone & Azen, plantar flexion 56±6, dorsiflexion 13±4 (more when the knee is bent and loaded),
 # inversion 37±5, eversion 21±5.
 #
-# Standard deviations of waist and ankles about zero, degrees. Chosen on the development captures; half and twice the
-# value change the mean errors of walk (32 frames) by 0.01 cm.
+# Standard deviations of waist and ankles about zero, degrees.
 _WAIST_DEG, _ANKLE_DEG = 12.0, 20.0
 # Standard deviation of the head's turn about the neck, degrees. Assumed: it makes a turn that three images of the face
-# show smaller by 10 %, with 30 by 20 %. With 15 to 60 the joints of four real people, arms excepted, are 3.7 to 3.8 cm
-# off on average.
+# show smaller by 10 %, with 30 by 20 %.
 _HEAD_TURN_DEG = 45.0
 # `offset_m`: length of the median offset in the trunk's frame, which `tk evaluate` removes, mean over both sides and
 # the recordings that docs/evaluation.md lists (`python -m scripts.joint_offsets`).

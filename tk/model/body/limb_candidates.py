@@ -1,7 +1,6 @@
 """Candidate poses of a limb over its whole range of motion, for the limb search.
 
-An arm's candidates are directions spread evenly over the sphere, each with the elbow straight or bent to one of several
-sides; a leg's are hip and knee angles on a grid. Both are relative to the trunk and within the limits.
+The candidates are spread evenly over the ranges of the limb's angles. Ankles stay at right angles.
 """
 
 from __future__ import annotations
@@ -15,26 +14,16 @@ from numpy.typing import NDArray
 from tk.kernels.cone_arrays import ConeArrays
 from tk.model.body.cone_body import ConeBody
 from tk.model.body.joints import CHAINS, JOINTS, LEANS, LIMBS
-from tk.model.body.skeleton import Skeleton, shoulder_angles
+from tk.model.body.skeleton import Skeleton
 
 Float = NDArray[np.float64]
 
-# Two poses of a limb are different if a joint's positions differ by more than this, metres. Half
-# and twice the value change the mean errors of dance and cube (50 frames) by 0.01 cm at most.
+# Two poses that have not settled are different if a joint's positions differ by more than this, metres.
 DISTINCT_M = 0.12
 
-# Grids of angles. The upper arm has directions on the sphere about 20° apart, without those through the back or far
-# across. Half and twice as many, and half and twice the other angles, change the mean errors of dance and cube
-# (50 frames) by 0.02 cm at most.
-_DIRECTIONS = 84
-_ELBOWS_DEG = (60.0, 115.0)
-_ARM_ROLLS_DEG = (-80.0, -30.0, 20.0, 70.0)
-_HIPS_DEG = (-20.0, 10.0, 40.0, 70.0, 100.0)
-_SPREADS_DEG = (-10.0, 10.0, 35.0)
-_LEG_ROLLS_DEG = (-25.0, 25.0)
-_KNEES_DEG = (5.0, 45.0, 85.0, 130.0)
+# Candidates of a limb, spread evenly over the ranges of its angles.
+SPREAD = 1024
 # Gauss-Newton steps of exchanged limbs, and their damping, m²: angles that move joints by less than 3 cm a radian stay.
-# In a walk, half and four times the steps, and half and twice the 3 cm, move exchanged joints by less than 0.1 cm.
 _EXCHANGE_STEPS, _EXCHANGE_DAMPING = 6, 0.03**2
 # Standard deviation of the angles of candidates near the current pose.
 _NEAR_DEG = 25.0
@@ -92,7 +81,9 @@ def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
         parts = np.array([part.segment in CHAINS[name] for part in body.parts])
         moved = np.array([part.segment in CHAINS[name][1:] for part in body.parts])
         dofs = np.flatnonzero(skeleton.chain_dofs(name))
-        grid = _arm_grid() if name.startswith("arm") else _leg_grid(len(dofs))
+        bent = ~skeleton.is_straight[dofs]
+        grid = np.zeros((SPREAD, len(dofs)))
+        grid[:, bent] = _spread(skeleton.lower[dofs[bent]], skeleton.upper[dofs[bent]])
         result.append(
             Limb(
                 name=name,
@@ -103,7 +94,7 @@ def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
                 still=np.flatnonzero(~moved).astype(np.int32),
                 arrays=arrays._replace(curves=arrays.curves[parts[arrays.curves[:, 0]]]),
                 joints=[JOINTS.index(joint) for joint in LIMBS[name][1:]],
-                grid=np.clip(grid, skeleton.lower[dofs], skeleton.upper[dofs]),
+                grid=grid,
             )
         )
     return tuple(result)
@@ -159,22 +150,10 @@ def _placed(pose: Float, both: Sequence[tuple[Limb, ...]], joints: Float) -> Flo
     return result
 
 
-def _arm_grid() -> Float:
-    """Return (N, 4) shoulder's yaw, pitch and roll, elbow, radians."""
-    # golden spiral: evenly spread over the sphere (forward, outward, up)
-    k = np.arange(_DIRECTIONS) + 0.5
-    polar, turn = np.arccos(1 - 2 * k / _DIRECTIONS), np.pi * (1 + np.sqrt(5)) * k
-    spread = np.column_stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)])
-    rows = []
-    for direction in spread[(spread[:, 0] > -0.75) & (spread[:, 1] > -0.8)]:
-        yaw, pitch = shoulder_angles(direction)
-        rows.append((yaw, pitch, 0.0, np.radians(10.0)))
-        rows += [(yaw, pitch, roll, elbow) for elbow in np.radians(_ELBOWS_DEG) for roll in np.radians(_ARM_ROLLS_DEG)]
-    return np.array(rows)
-
-
-def _leg_grid(dofs: int) -> Float:
-    """Return (N, dofs) hip's pitch, yaw and roll, knee, radians, and a foot at right angles."""
-    angles = np.meshgrid(-np.radians(_HIPS_DEG), *map(np.radians, (_SPREADS_DEG, _LEG_ROLLS_DEG, _KNEES_DEG)))
-    rows = np.stack([axis.ravel() for axis in angles], axis=1)
-    return np.hstack([rows, np.zeros((len(rows), dofs - 4))])
+def _spread(lower: Float, upper: Float) -> Float:
+    """Return (N, L) angles between limits (L,), radians, by the additive recurrence whose steps are powers of the
+    generalised golden ratio (Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018)."""
+    count = len(lower)
+    golden = np.roots([1.0, *np.zeros(count - 1), -1.0, -1.0]).real.max()  # x^(L + 1) = x + 1
+    steps = golden ** -np.arange(1.0, count + 1)
+    return np.asarray(lower + (upper - lower) * (np.arange(1.0, SPREAD + 1)[:, None] * steps % 1.0))

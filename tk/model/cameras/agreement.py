@@ -22,20 +22,19 @@ from tk.optim.trajectory import gauge_projection
 
 Float = NDArray[np.float64]
 
-# Prior standard deviations of a camera's shift, pixels, and delay, frames: wide, so that 20 frames outweigh them.
+# Prior standard deviation of a video's delay, frames.
+OFFSET_FRAMES = 2.0
+# Prior standard deviations of a camera's shift, pixels, and of its delay: wide, so that 20 frames outweigh them.
 # With two cameras, a sideways turn of one looks like another position of the person, and only the person's size
 # contradicts it. So each of two cameras also has an unknown focal length (its logarithm).
-_SIGMA = {"shift": 5.0, "offset": 2.0}
-_SIGMA_OF_TWO = {"shift": 5.0, "focal": 0.05, "offset": 2.0}
+_SIGMA = {"shift": 5.0, "offset": OFFSET_FRAMES}
+_SIGMA_OF_TWO = {"shift": _SIGMA["shift"], "focal": 0.05, "offset": OFFSET_FRAMES}
 # Half the difference of points for a derivative, metres.
 _STEP_M = 1e-4
 # Cameras disagree if a shift exceeds this angle, degrees, or a delay this part of a frame, and either exceeds this many
-# standard deviations (three: one false alarm in 370). Captures with exact cameras (walk, dance) show 0.02° and 0.01
-# frames; lower limits refine cameras that are right.
+# standard deviations (three: one false alarm in 370).
 INCONSISTENT_DEG, LATE_FRAMES, SIGNIFICANT = 0.06, 0.2, 3.0
 # Two cameras contradict each other if they show the person larger and smaller by more than this share, significantly.
-# 24 pairs of correct cameras of the development captures: at most 0.002. One of them turned by 3°: 0.008 to 0.018 where
-# the start finds no contradiction.
 SIZE = 0.005
 # An edge's weight falls to a quarter at robust_px: less than in the tracker's search, because a camera can do without
 # the edges of folds, shadows and hands.

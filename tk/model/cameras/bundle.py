@@ -29,17 +29,16 @@ from tk.optim.trajectory import Equations
 
 Float = NDArray[np.float64]
 
-# Ranges below: the mean errors of walk and dance (60 frames) change by less than 0.1 cm, by `scripts.sensitivity`.
-# Standard deviation of an edgel's distance, pixels: ragged masks, and shapes that no cone has. Range 1.5 to 6.
+# Standard deviation of an edgel's distance, pixels: ragged masks, and shapes that no cone has.
 EDGE_NOISE_PX = 3.0
-# Edgels within this length of a contour err together, pixels. Only its product with EDGE_NOISE_PX² counts: 2.5 to 40.
+# Edgels within this length of a contour err together, pixels. Only its product with EDGE_NOISE_PX² counts.
 CORRELATION_PX = 10.0
 # Information of one pixel of contour, 1/px².
 INFORMATION = 1.0 / (EDGE_NOISE_PX**2 * CORRELATION_PX)
 # Between samples of a contour, pixels: no more than these are independent, by CORRELATION_PX.
 SPACING_PX = 6.0
 # Standard deviation of a degree of freedom about the given pose, radians or metres; of waist and ankles about zero,
-# because a bent waist and another trunk look alike. Range 0.15 to 0.6.
+# because a bent waist and another trunk look alike.
 POSE_DEVIATION = 0.3
 # Standard deviation, metres, of a segment's position along an axis in one frame about that of skeleton and pose: no
 # human joint is a hinge, and clothes stand off by 1 to 3 cm. Without this freedom the cameras bend to suit the

@@ -172,7 +172,7 @@ class _Pairs(NamedTuple):
         both = _Points.of(sets.of_cameras(pairs))
         beside = _Points(both.at[:, None], both.covariance[:, None], both.right[:, None])
         fit = sets.showing(beside)
-        for own, other in (pairs.T, pairs.T[::-1]):  # each of a pair is compared with the other alone
+        for own, other in (pairs.T, pairs.T[::-1]):  # each camera is compared with the other alone
             alone = _Points.of(sets.of_cameras(other[:, None]), both.at)
             fit[np.arange(len(pairs)), own] = sets.of_cameras(own).showing(alone)
         return _Pairs(sets, pairs, both.at, fit)

@@ -21,9 +21,9 @@ DEFAULT_UP = "z"
 SNAP_DEG = 10.0
 
 # A camera is upright if its rightward direction is off the horizontal by at most _UPRIGHT_DEG, which hand-held and
-# clamped cameras keep (Pose2Sim's demo: 24°), and if up in its image points up, i.e. is at most _ASIDE_DEG off. A
+# clamped cameras keep (Pose2Sim's demo: 24°), and if up in its image points up, i.e. is at most _LEVEL_DEG off. A
 # camera that looks straight down or up shows no upward direction.
-_UPRIGHT_DEG, _ASIDE_DEG = 35.0, 70.0
+_UPRIGHT_DEG, _LEVEL_DEG = 35.0, 70.0
 
 #: cameras are rolled if their rightward directions are off the horizontal by more than this, root mean square, degrees
 _ROLLED_DEG = 4.0
@@ -127,9 +127,9 @@ def _vote(rig: Rig, right: Float, above: Float) -> tuple[NDArray[np.bool_], NDAr
     ups = np.array(proposed)  # (K, 3)
     off = np.abs(ups @ right.T)  # (K, C) sine of the roll
     high = ups @ above.T
-    aside = np.cos(np.radians(_ASIDE_DEG))
+    level = np.cos(np.radians(_LEVEL_DEG))
     straight = off <= np.sin(np.radians(_UPRIGHT_DEG))
-    votes, abstains = straight & (high > aside), straight & (np.abs(high) <= aside)
+    votes, abstains = straight & (high > level), straight & (np.abs(high) <= level)
     # of equal numbers of votes, the direction along which the cameras are rolled least
     rolls = np.where(votes, off**2, 0.0).sum(axis=1) / np.maximum(votes.sum(axis=1), 1)
     best = int(np.lexsort((rolls, -votes.sum(axis=1)))[0])

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
-from tk.model.cameras.agreement import CAMERA_SEARCH, SCALE_DEVIATION
+from tk.model.cameras.agreement import CAMERA_SEARCH, OFFSET_FRAMES, SCALE_DEVIATION
 from tk.model.cameras.bundle import CAMERA_PARAMETERS, LONGEST_STEP, residual_px
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.people_bundle import Filmed, PeopleBundle
@@ -26,10 +26,8 @@ from tk.optim.trajectory import gauge_projection, minimise
 Float = NDArray[np.float64]
 
 # Prior standard deviations of a calibration: of a turn about an axis, of a centre's place along one, of the logarithm
-# of a focal length; of a video's delay in frames. For calibrations with errors of about 0.25° and 10 mm; `trust` scales
-# the first two. On dance with a camera turned by 0.5°, and walk with a video three frames late, twice the first value
-# changes the mean errors by 0.11 cm, half of it by 0.04; half and twice the others by 0.01 at most.
-TURN_DEG, MOVE_M, FOCAL, OFFSET_FRAMES = 0.18, 0.007, 0.01, 2.0
+# of a focal length. For calibrations with errors of about 0.25° and 10 mm; `trust` scales the first two.
+TURN_DEG, MOVE_M, FOCAL = 0.18, 0.007, 0.01
 # The iteration has converged when all steps are below this share of the prior standard deviations: a change of 0.007°.
 _SMALL = 0.04
 # A camera's placement counts as observed if its standard deviation is below this share of the prior one.

@@ -30,11 +30,10 @@ _YUV_FROM_BGR = np.round([_LUMA, *_COLORS], 3)
 
 # α of eq. 16: the paper's.
 RATE = 0.3
-# Minimum standard deviations of Y, U, V, levels of 255: shading changes Y more than U and V. With half and twice the
-# values the mean errors of walk and dance (45 frames) change by 0.05 and 0.17 cm.
+# Minimum standard deviations of Y, U, V, levels of 255: shading changes Y more than U and V.
 FLOOR_YUV = (16.0, 6.0, 6.0)
 # A voxel fits a patch if every channel lies within this many standard deviations of the mean. The paper does not say
-# what fits. With half and twice the value the mean errors of walk and dance (45 frames) change by 0.18 and 0.14 cm.
+# what fits.
 WIDTH = 2.5
 
 

@@ -34,14 +34,11 @@ RENEW = 5
 # the trunk and on an arm are equally uncertain: both come from the same voxels. In units of the diameter the trunk,
 # five times as thick, weighs a twenty-fifth and follows the arms.
 SIGMA_M = 0.1
-# Leclerc's ν of eq. 9, in units of ½ (d/σ)². The paper prints none. With half and twice the value the mean errors of
-# walk and dance (45 frames) change by 0.09 cm at most.
+# Leclerc's ν of eq. 9, in units of ½ (d/σ)². The paper prints none.
 EDGE_NU = 0.1
-# How far from the contour edges are searched, metres at the limb. With half and twice the value the mean errors of walk
-# and dance (45 frames) change by 0.06 cm at most.
+# How far from the contour edges are searched, metres at the limb.
 REACH_M = 0.08
-# Least colour gradient of an edge, 0 to 1. The paper tuned its own by hand for each camera. With half and twice the
-# value the mean errors of five captures (45 frames) change by 0.04 cm at most.
+# Least colour gradient of an edge, 0 to 1. The paper tuned its own by hand for each camera.
 THRESHOLD = 0.12
 # The chains with contour points, in the order of :data:`LIMBS`: two segments each.
 _LIMB_CHAINS = [list(CHAINS).index(chain) for chain in joints.LIMBS]
@@ -120,7 +117,7 @@ class ContourTerm:
         entries[:, a.INV_SIGMA2] = 1 / (SIGMA_M * pixels_a_metre) ** 2
         entries[:, a.STATE] = np.where(any_seen, a.ASSIGNED, a.UNASSIGNABLE)
         entries[:, a.NU] = EDGE_NU
-        # every contour point has the same weight, alone or in a pair; the hidden half of a pair has its own entry
+        # every contour point has the same weight, alone or with another; the hidden one of two has its own entry
         found = points.found[b, v, k].sum(axis=1)
         share = self.weight / np.bincount(b, found, minlength=B)[b]
         entries[:, a.SCALE] = share * np.where(any_seen, seen.sum(axis=1), found)

@@ -40,17 +40,12 @@ Float = NDArray[np.float64]
 NAME = "landmarks"  #: of the cue
 # Standard deviation of a landmark in an image, metres along each axis at the person's distance, for a person of average
 # stature: SEEN_M with visibility 1, HIDDEN times as much with visibility 0; and the share of landmarks that are right.
-# Measured on 33 frame sets, three of them of people before markers (1,860 landmarks): at a visibility
-# above 0.9, of 0.5 and below 0.1, medians of 3.7, 6.1 and 14 cm, and 5, 24 and 50 % beyond 12 cm.
 SEEN_M, HIDDEN, RIGHT_SEEN, RIGHT_HIDDEN = 0.023, 4.0, 0.95, 0.5
 # Depth between the ends of a bone, as a network estimates it: it keeps this share of the depth (of shoulders and hips;
 # of the limbs' bones), because a cautious estimate is too near to the mean. Standard deviation, metres, at a visibility
-# of 1, and how many times as much at a visibility of 0. Measured on 120 bones of people before markers and 1,960 of
-# rendered people, which agree: shares 0.8 to 0.95 and 0.57; deviations 0.057 and 0.062 above 0.95, 0.10 below 0.5.
+# of 1, and how many times as much at a visibility of 0.
 DEPTH_SHARE, DEPTH_M, DEPTH_HIDDEN = (0.9, 0.6), 0.055, 1.8
-# Density of a wrong depth, 1/m: it lies anywhere within a bone's length.
-WRONG_DEPTH = 2.0
-# Density of a wrong landmark, 1/m²: it lies anywhere on a standing person.
+# Density of a wrong landmark, 1/m²: it lies anywhere on a standing person; and of a wrong depth, 1/m.
 WRONG_DENSITY = 2.0
 # The next two are assumed; neither they nor INDEPENDENT have been calibrated by the share of right choices yet.
 # Probability that a network exchanges left and right of one half of the body in an image.
@@ -62,13 +57,11 @@ ELSEWHERE = 0.02
 OFFSET_M = 0.02
 # Least visibility of landmarks whose box is compared with the box of a mask, and least overlap of both boxes.
 LEAST_VISIBLE, LEAST_OVERLAP = 0.2, 0.2
-# A proposal minimises the landmarks' cost with standard deviations that are larger by these factors, one after the
-# other: a pose that is far away is attracted, too. A step changes no angle by more than LONGEST_STEP; angles that the
-# landmarks leave open stay near the figure from which it began, by OPEN_ANGLE, radians.
-WIDENED, LONGEST_STEP, OPEN_ANGLE = (16.0, 16.0, 16.0, 8.0, 8.0, 8.0, 4.0, 4.0, 2.0, 2.0, 1.0, 1.0), 0.6, 3.0
+# Factors of the standard deviations with which a proposal minimises the landmarks' cost, two steps each: a pose that
+# is far away is attracted, too. Largest change of an angle in a step, radians.
+WIDENED, LONGEST_STEP = (16.0, 8.0, 4.0, 2.0, 1.0), 0.6
 # Weight of the landmarks in the contours' equations: these count the edgels of a segment as independent, but clothes
-# and wrong pieces of a mask displace all of them together. With 10 and 20, four real people have errors of 5.8 and 6.2
-# cm instead of 5.2 on average (docs/experiments.md).
+# and wrong pieces of a mask displace all of them together.
 WEIGHT = 5.0
 # Share of the landmarks' likelihood that counts: a network's errors in neighbouring landmarks go together.
 INDEPENDENT = 0.5
@@ -286,8 +279,8 @@ class LandmarkCue:
         sigma = self._widened * DEPTH_M * self._size * DEPTH_HIDDEN ** (1.0 - visibility)
         r = np.where(known, seen, 0.0) - np.einsum("...vi,...ki->...vk", self._sight, bones)
         inside = right / (np.sqrt(2 * np.pi) * sigma) * np.exp(-0.5 * (r / sigma) ** 2)
-        both = inside + (1.0 - right) * WRONG_DEPTH
-        return np.log(both / WRONG_DEPTH), inside / both, r, np.broadcast_to(sigma, both.shape)
+        both = inside + (1.0 - right) * WRONG_DENSITY
+        return np.log(both / WRONG_DENSITY), inside / both, r, np.broadcast_to(sigma, both.shape)
 
 
 def _with_bones(values: Float) -> Float:
@@ -350,9 +343,9 @@ def propose(rig: Rig, body: ConeBody, seen: Float, p_near: Float) -> Float:
     """
     skeleton = body.skeleton
     start = figures(skeleton, p_near)
-    prior = Quadratic.about(start, np.where(skeleton.prismatic, 1.0, OPEN_ANGLE) ** -2.0)
+    prior = Quadratic.about(start, np.where(skeleton.prismatic, 1.0, np.pi) ** -2.0)
     poses = start
-    for widened in WIDENED:
+    for widened in np.repeat(WIDENED, 2):
         cost = LandmarkCue(rig, body, seen, widened).normal(poses) + prior
         step = np.linalg.solve(cost.matrix, cost.linear[..., None])[..., 0] - poses
         poses = skeleton.clip(poses + np.clip(step, -LONGEST_STEP, LONGEST_STEP))

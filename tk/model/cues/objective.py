@@ -45,22 +45,20 @@ BARRED = _barred()
 # optimisation of all degrees of freedom; each chain has its share of the last.
 TORSO_SAMPLES, CHAIN_SAMPLES, COVERAGE_VOXELS = 60, 20, 150
 # Search radius of a sample for its voxel, and of a voxel for the body, metres: three σ. A smaller one ignores pairs
-# that still pull. With 0.5 for voxels the mean errors of five captures (60 frames, three seeds) change by 0.03 cm.
+# that still pull.
 REACH_M = 0.3
-# Leclerc's ν of eq. 9, in units of ½ (d/σ)². The paper prints none. With half and twice the value the mean errors of
-# walk and dance (45 frames) change by 0.06 cm at most.
+# Leclerc's ν of eq. 9, in units of ½ (d/σ)². The paper prints none.
 SURFACE_NU = 0.35
-# Leclerc's ν of the coverage term, as a multiple of the surface term's: voxels of a limb that the body has left are
-# far away. At 1 an arm stays lost in one of three runs of dance; with 4 the mean errors of walk and dance change by
-# 0.03 cm.
+# Leclerc's ν of the coverage term, as a multiple of the surface term's: voxels of a limb that the body has left are far
+# away.
 COVERAGE_SOFTNESS = 2.0
 # Minimum weight of a pair in the Hessian, so that a limb far from its data keeps some curvature; at 0 its steps grow
-# without bound. With half and twice the value the mean errors of walk and dance (45 frames) change by 0.04 cm at most.
+# without bound.
 OUTLIERS = 0.1
 # Voxels on which poses are compared, evenly spread. More cost time only.
 EVEN_VOXELS = 600
 # A voxel farther than this from the nearest piece may belong to another one, metres: voxels lie 2 to 3 cm from their
-# piece. With half and twice the value the mean errors of walk and dance (45 frames) change by 0.03 cm at most.
+# piece.
 NEAR_M = 0.05
 
 

@@ -23,17 +23,15 @@ from tk.model.stateful import Stateful
 
 Float = NDArray[np.float64]
 
-# Half and twice the value of the following three change the mean errors of dance and cube (50 frames) by less than
-# 0.1 cm, by 0.02 cm with all but twice the first.
-# Standard deviation of the smoothing over bins, in bins: gain and white balance differ a little between cameras.
+# Standard deviation of the smoothing over bins, in bins: gain and white colour differ a little between cameras.
 _SMOOTHING = 0.7
 # Share of a part's pixels that may have any colour: outlines, shadows, carried objects.
 _ANYTHING = 0.02
-# Share of the histograms that a frame replaces: they follow a change of light within about 20 frames.
-_RATE = 0.05
-# Logarithm of the largest likelihood ratio that one pixel may give. Half and twice: 0.02 cm at most.
+# Share of what is learned that a frame replaces: it follows a change of light or clothes within about 20 frames.
+RATE = 0.05
+# Logarithm of the largest likelihood ratio that one pixel may give.
 _MOST_LOG_RATIO = 5.0
-# Weight of a contour between two parts of different colours, relative to a silhouette's edge. 0.35: 0.05 cm worse.
+# Weight of a contour between two parts of different colours, relative to a silhouette's edge.
 _CONTOUR_WEIGHT = 0.5
 
 
@@ -95,7 +93,7 @@ class PartColors(Stateful[LearnedColors]):
         flat = self._group[label[shown].astype(np.int64) - 1] * COLOR_BINS + bins[shown]
         seen = np.bincount(flat, minlength=counts.size).reshape(counts.shape)
         outside = np.bincount(bins[~shown], minlength=COLOR_BINS)
-        rate = _RATE if self.known else 1.0
+        rate = RATE if self.known else 1.0
         self._counts = (1 - rate) * counts + rate * seen
         self._outside = (1 - rate) * before + rate * outside
         self._update()

@@ -26,11 +26,8 @@ from tk.model.reduced_images import every
 
 Float = NDArray[np.float64]
 
-# Cost of a colour that certainly belongs to another part; below 1, because colours are wrong more often than masks.
-# With half and twice the value the mean errors of dance and cube (60 frames) change by 0.03 cm at most.
-COLOR_COST = 0.4
-# Cost of a part on a pixel outside the mask that is uncertain (a shadow, or clothes of the background's colour): both
-# values are equally likely.
+# Cost of what may be right or wrong: a part on an uncertain pixel outside the mask (a shadow, or clothes of the
+# background's colour), or on a colour that certainly belongs to another part.
 UNCERTAIN_COST = 0.5
 # Negative logarithm of the likelihood for a mismatch of 1 in a view. With four views 0.004 is then one nat. The
 # probabilities of choices that follow are right or too cautious (docs/experiments.md).
@@ -38,7 +35,6 @@ VIEW_NATS = 60.0
 # The mismatch of a view is divided by the number of the person's rays. Where others hide most of the person, the
 # divisor is at least this share of the largest number in any view, so that a hand beside a back counts less than a
 # person.
-# Chosen on pair. With one person (dance and cube, 50 frames) half and twice the value change no mean error.
 LEAST_SEEN = 0.25
 
 
@@ -124,7 +120,7 @@ class Evidence:
         rays[..., 1:] = np.where(person, 0.0, outside)[..., None]
         bins = None if images is None or images.size == 0 else color_bins(grid.sample(images))
         if bins is not None and colors is not None and colors.known:
-            rays[person, 1:] = COLOR_COST * colors.mismatch[bins[person]]
+            rays[person, 1:] = UNCERTAIN_COST * colors.mismatch[bins[person]]
         return Evidence(grid, person, rays, bins, others if shared else None, cues)
 
     def mismatch(

@@ -29,11 +29,10 @@ LEAST_LITRES = 10.0
 # A region of a mask belongs to the person within this many voxels of the hull: thin limbs contain no voxel's centre.
 _NEAR_VOXELS = 2.5
 # With this many cameras that see a voxel, one of them may be wrong, if the hull would otherwise shrink to this share.
-# Half and twice the share change no mean error of dance and cube (50 frames).
 _ENOUGH, _MUCH_SMALLER = 4, 0.4
 # Half the diagonal of a voxel, in edges.
 _HALF_DIAGONAL = np.sqrt(3.0) / 2
-# Directions in which an extent is measured: to the faces, edges and corners of a cube.
+# Directions in which an extent is measured: to the faces, edges and corners of a voxel.
 _DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d > (1, 1, 1)], np.float64) - 1.0
 _DIRECTIONS /= np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)
 

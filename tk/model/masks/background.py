@@ -20,11 +20,10 @@ _DARKEST, _BRIGHTEST = 20, 245  # usable grey levels: darker ones are mostly noi
 _LEAST_SAMPLES = 64  # with fewer usable samples the gain is 1; the median of 64 has an error of 0.16 deviations
 _OUTLIER = 3.0  # samples beyond this multiple of the median residual are no empty scene
 
-# Least noise variance of a pixel as a share of its image's: coding removes small noise in places, temporarily. Without
-# it masks change by 0.1 to 0.5 %.
+# Least noise variance of a pixel as a share of its image's: coding removes small noise in places, temporarily.
 _LEAST_RELATIVE_NOISE = 0.5
 
-# Motion of camera and coding, pixels: adds noise where the plate has contrast. Without it 0.4 to 2 % more surplus area.
+# Motion of camera and coding, pixels: adds noise where the plate has contrast.
 _JITTER_PX = 0.04
 
 

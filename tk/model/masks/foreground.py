@@ -48,76 +48,60 @@ from tk.model.masks.person_boxes import PersonBoxes
 from tk.model.masks.regions import clean_by_area, closed, enclosed, person_parts, trim_rim, without_penumbrae
 from tk.settings import ForegroundSettings
 
-# The constants below were chosen on rendered captures with exact masks and on one real capture. Where a sensitivity is
-# given, it is the mean change of the masks of walk, dance, fold, cube, kick, wash and punch, in % of the person's area.
+# The constants below were chosen on rendered captures with exact masks and on one real capture.
 
-# Side of the square of pixels that is one pixel of the reduced image. With 1, noise hides the sleeves of a grey man on
-# a grey floor, and the test takes four times as long.
+# Side of the square of pixels that is one pixel of the reduced image.
 _REDUCTION = 2
 
 # Images with more noise (variance of a reduced pixel, grey levels²) are averaged over 3×3 reduced pixels before the
-# test. At 25 (10 levels in a full pixel) averaging adds 4 % of surplus area and finds 0.4 % more of the person; at 150
-# walk, dance and cube miss 2.9, 4.1 and 5.0 % of the person without it, and 0.8, 1.7 and 1.0 % with it. Captures have
-# 1 to 3.
+# test.
 _NOISY = 40.0
-
-# Each further foreground neighbour divides the threshold by 2 to this power. Griesser et al. derive such a term from a
-# Markov random field and choose its weight by hand. Without the term (0) masks change by 0.01 to 0.3 %.
-_NEIGHBOUR_OCTAVES = 0.5
-_ITERATIONS = 3  # updates of the labels with the neighbours' term; with 1 masks change by less than 0.1 %
 
 # Plain difference, in noise variances, below which a pixel is background whatever its neighbours are. Noise alone gives
 # a mean of 0.5 and a 99.9 % quantile of 1.03 (chi-square with 27 degrees of freedom, over 54); the remaining factor is
-# for coding noise, which is correlated within a window. At 1 the surplus area is 4 to 9 % larger.
+# for coding noise, which is correlated within a window.
 _DIFFERENCE_MIN = 2.0
 
 # Constant component added to both vectors, grey levels (Griesser et al., chosen by hand there, too): windows darker
-# than about ten grey levels are compared by their difference. From 1 to 40 masks change by less than 0.1 %.
+# than about ten grey levels are compared by their difference.
 _DARKNESS_OFFSET = 40.0
 
 # A mean over 3×3 reduced pixels that is brighter than the scene by this many standard deviations of its noise is
-# foreground, because shadows only darken. Four: by chance once in 30,000 pixels. Without the rule, clothes that are
-# slightly brighter than the scene are missed; masks change by 0.02 to 0.3 %.
+# foreground, because shadows only darken. Four: by chance once in 30,000 pixels.
 _BRIGHT_DEVIATIONS = 4.0
 # Brightest light relative to a learned scene, which may lie in the person's own shadow; there being brighter is no sign
-# of the person. On dance without its empty scene 1 adds 2 to 11 % of surplus area; 2 changes nothing.
+# of the person.
 _LIGHT = 1.5
 _BRIGHT_STEP = 16  # rows and columns from one such mean to the next, where its noise is measured; affects speed only
 
 # Variance added to the measured noise, grey levels², for video coding: coding removes small noise in places, and its
-# errors are correlated within a window. At 0.3 and 1.4 masks change by 1 to 4 %; more leaves holes in grey clothes.
+# errors are correlated within a window.
 _NOISE_FLOOR = 0.7
 # The same with a single image of the empty scene, whose own coding errors and later changes of the light are not
-# averaged out. Chosen on one real capture. Half and twice the value change the mean errors of walk and dance with one
-# image of the empty scene (60 frames) by 0.06 and 0.03 cm.
+# averaged out. Chosen on one real capture.
 _STILL_NOISE = 15.0
 
 # A label is the edge of a shadow if the statistic is below this share of the plain difference nearby. The statistic
-# gives 0.29 at a sharp edge and 0.05 over a blur of four reduced pixels. Without the rule shadows are foreground.
+# gives 0.29 at a sharp edge and 0.05 over a blur of four reduced pixels.
 _PENUMBRA = 0.2
-# Thick labels with a larger statistic than this, in noise variances, are no edge of a shadow. At 3 the surplus area is
-# 1.2 to 2.4 % larger; without the rule 2.4 to 4.5 % more of the person is missing.
+# Thick labels with a larger statistic than this, in noise variances, are no edge of a shadow.
 _CORE = 8.0
 
 # A region that may be cloth or shadow is foreground if it touches certain foreground with more than this share of its
-# border: a clear majority, because a shadow between two legs touches them on two sides. At 0.5 masks change by 0.1 to
-# 0.8 %; without the rule 0.3 % more of the person is missing on cube.
+# border: a clear majority, because a shadow between two legs touches them on two sides.
 _ENCLOSURE = 0.6
 # Such a region is also foreground in gaps of the person up to this width, as a share of the image height (10 of 480
-# pixels). Without the rule masks change by 0.2 to 1.6 %.
+# pixels).
 _BRIDGE = 0.02
 
-# Parts of the person other than the largest need pixels of this statistic, in noise variances. At 8 masks change by
-# less than 0.15 % on the captures above, but by 7 % on balance, where shadows remain.
+# Parts of the person other than the largest need pixels of this statistic, in noise variances.
 _SEED = 64.0
 
 _RIM_LAYERS = 4  # depth of the rim, full pixels: two reduced pixels, the reach of a window and one for the reduction
 # A pixel of the rim is kept if it has this share of the largest contrast nearby. 0.5 is unbiased at a sharp outline;
 # less is cautious, because a pixel too many makes the hull a little larger and one too few cuts through it.
-# With half and twice the value the mean errors of dance and cube (50 frames) change by less than 0.1 cm.
 _RIM = 0.3
-# Smaller connected parts are removed and smaller holes filled, share of the image area (61 pixels of 640×480). Without
-# it masks change by 0.1 to 0.5 %; filling holes of twice the size changes less than 0.2 %.
+# Smaller connected parts are removed and smaller holes filled, share of the image area (61 pixels of 640×480).
 AREA_MIN = 2e-4
 
 
@@ -290,8 +274,6 @@ class CollinearityForeground:
             light_max=_LIGHT if self._learned else 1.0,
             difference_min=_DIFFERENCE_MIN,
             threshold=self.config.threshold,
-            octaves_per_neighbour=_NEIGHBOUR_OCTAVES,
-            iterations=_ITERATIONS,
         )
         person, doubt = self._decide(mosaic, prior)
         self._outline(images, gains, person, mosaic, masks)
@@ -325,7 +307,7 @@ class CollinearityForeground:
         statistic = self._statistic
         difference, collinearity = statistic.difference, statistic.collinearity
         seen = difference > 0
-        certain = without_penumbrae(statistic.labels.view(np.bool_), difference, collinearity, _PENUMBRA, _CORE)
+        certain = without_penumbrae(statistic.labels, difference, collinearity, _PENUMBRA, _CORE)
         if not self._learned:
             certain |= statistic.bright.view(np.bool_)
         if self._small_unknown is not None and prior is not None:

@@ -18,15 +18,12 @@ from tk.model.stateful import Stateful
 
 # Rows of an image that are compared, approximately.
 _ROWS = 64
-# An image is blank if the standard deviation of its grey levels is below this: above the sensor's noise. The least of
-# nine development captures is 13.
+# An image is blank if the standard deviation of its grey levels is below this: above the sensor's noise.
 _BLANK_LEVELS = 3.0
 # Two images are the same if at most this share of the pixels differs by more than this many levels, which covers what
-# the coding of a still video changes. Of walk, dance, fold and cube with one frozen video, 26 to 29 of 29 frames are
-# recognised; with half and twice the levels 12 to 29, with half and twice the share 23 to 29. No false alarm with any.
+# the coding of a still video changes.
 _SAME_LEVELS, _SAME_SHARE = 6, 0.001
-# Change of another camera's mask, as a share of its area, that shows movement. The same frames: with half the value 27
-# to 29, with twice the value 5 to 29 of 29, because the person in fold moves little. No false alarm.
+# Change of another camera's mask, as a share of its area, that shows movement.
 _MOVED = 0.15
 
 # A camera has been moved if its image has, by more than this share of its longer side: 0.3° with a lens of 60°. The
@@ -34,13 +31,9 @@ _MOVED = 0.15
 MOST_SHIFT = 0.005
 
 # Something moves in the images of a camera if at least this share of the pixels differs by more than this many levels:
-# the first is a quarter of a small person, the second more than the noise of 24 frames. Nine development captures have
-# 2.8 to 14 % of such pixels, with half and twice the levels 4 to 19 % and 0.6 to 9 %; a clip of an empty scene none.
+# the first is a quarter of a small person, the second more than the noise of 24 frames.
 _MOVED_LEVELS, _MOVED_SHARE = 40, 0.005
-# Least probability that an image changes more where its mask changes than beside the masks. In five frames of walk,
-# dance, fold, cube, sixteen, rig9, pair, hd, treadmill-slow, balance and wild: 0.94 to 0.99; with holes in each mask,
-# masks 7 pixels too large, or noise of 25 levels 0.90 to 0.99 (treadmill-slow with noise: 0.84); with masks 25 frames
-# early or late 0.48 to 0.86 (treadmill-slow, who walks on the spot: 0.87 and 0.88).
+# Least probability that an image changes more where its mask changes than beside the masks.
 _FOLLOWS = 0.87
 
 Sampled = tuple[NDArray[np.int16], NDArray[np.bool_]]

@@ -19,19 +19,15 @@ from tk.model.masks.background import Images, flicker
 
 Bool = NDArray[np.bool_]
 
-# The constants were chosen on walk and dance without their empty scenes, against the empty scenes.
-
 # Pixels within the first share of the person's height around a mask may show the person and are not used; within the
 # second share they may be a limb that the segmenter has missed, or a contact shadow.
 _NEAR, _MARGIN = 0.007, 0.06
 _BESIDE, _AWAY = 1, 2  # weight of a sample in the margin, and beyond it
 # Samples agree if no channel differs by more grey levels: three standard deviations of a difference at a noise of 2.3.
-# With 16, 0.1 to 0.5 % more of the known pixels are wrong by more than 6 levels; 8 and 12 are as good as 10.
 _TOLERANCE = 10
 # Support of a group that is brighter than the largest group, which then is a shadow: two samples.
 _LEAST_LIT = 3
-# Least factor of a shadow, and largest difference between the factors of its channels. Half and twice the values change
-# the mean errors of walk and dance without an empty scene (60 frames) by 0.04 cm at most.
+# Least factor of a shadow, and largest difference between the factors of its channels.
 _DARKEST, _SPREAD = 0.4, 0.12
 
 

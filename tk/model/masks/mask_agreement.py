@@ -28,11 +28,7 @@ Float = NDArray[np.float64]
 Masks = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 
-# Error of a pair that correct cameras may have, as a share of the person's size, plus one pixel of either mask.
-# The worst pair of correct cameras has 0.2 tolerances on the opening of walk, dance, fold, cube and pair; against a
-# learned scene, in which shadows remain at the feet, 0.2 to 0.8. Of cameras turned by 2° and by 3°, 60 and 70 % are
-# found, all of them rightly; the others turn about the person. Another recording's calibration has 7 to 23. Below 0.01,
-# cameras are excluded that the refinement would mend; with 0.03, a camera turned by 3° about its upright axis stays.
+# Error that two correct cameras may have, as a share of the person's size, plus one pixel of either mask.
 TOLERANCE = 0.012
 # Voxels along the working volume's longest side; those near the person are divided by two.
 _COARSE = 36
@@ -42,12 +38,10 @@ _ROWS = 120
 # outside, segmented ones 1 to 3 %.
 INCONSISTENT = 0.06
 # One camera is identified as wrong if the share outside falls to this fraction without it. If none is identified, the
-# cameras are refused above this many times INCONSISTENT: poor masks of correct cameras leave 4 % (treadmill-slow).
+# cameras are refused above this many times INCONSISTENT.
 _LEFT_OVER, _REFUSED = 0.5, 2.0
-# Share of a mask that may stay outside when it is shifted into the hull of the others: what segmented masks leave.
-_OUTSIDE_SHIFTED = 0.03
-# Without a majority, exchanged videos are searched for among at most this many cameras: sixteen would take five s,
-# and without two of them the others are a majority.
+# Without a majority, exchanged videos are searched for among at most this many cameras: of more, without two of them,
+# the others are a majority.
 _SWAPS_OF = 8
 
 _CAUSES = (
@@ -356,7 +350,7 @@ class MaskAgreement:
             area += float(mask.sum())
         if area == 0.0:
             return np.full(2, np.nan)
-        shifts = np.argwhere(inside >= (1 - _OUTSIDE_SHIFTED) * area)[:, ::-1] - reach
+        shifts = np.argwhere(inside >= (1 - INCONSISTENT / 2) * area)[:, ::-1] - reach
         if len(shifts) == 0:
             return np.full(2, np.nan)
         return np.asarray(shifts[np.argmin((shifts**2).sum(axis=1))] * float(self.step), np.float64)

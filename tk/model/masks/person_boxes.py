@@ -15,12 +15,10 @@ from tk.model.masks.regions import SQUARE3
 
 _DEVIATIONS = 3.0  # a coarse pixel differs from the scene by this many standard deviations of a reduced pixel's noise
 _WHOLE = 128  # fixed-point value of the share 1 of the scene's light, so that twice the light fits into a byte
-_CROWD = 4  # of nine neighbouring coarse pixels, the number that must differ; without it boxes are larger, masks equal
 # Side of a cell in coarse pixels. Regions in cells that touch, or are one cell apart, are one region. It sets how far a
-# hand may be from the body. Half and twice the value change nothing on dance and cube (50 frames).
+# hand may be from the body.
 _CELL = 4
-# Regions with a smaller share of the largest region's pixels are ignored. From 0 to 0.1 the masks of seven captures are
-# equal; with 0 the boxes are larger and segmentation slower.
+# Regions with a smaller share of the largest region's pixels are ignored.
 _SHARE = 0.02
 # Margin of a box, share of the image height. In 535 images of five rendered captures a margin of 20 of 240 pixels cuts
 # nothing off; one of 12 pixels cuts a hand off in five of them.
@@ -68,8 +66,6 @@ class PersonBoxes:
         beyond = np.asarray(cv2.max(cv2.max(blue, green), cv2.max(red, tinted)), np.uint8).reshape(count, -1)
         least = (_DEVIATIONS * np.sqrt(noise)).astype(np.uint8)
         differs = (beyond > least[:, None]).reshape(-1, width).view(np.uint8)
-        crowd = cv2.boxFilter(differs, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-        differs &= crowd >= _CROWD
         cells = cv2.boxFilter(
             differs, -1, (_CELL, _CELL), anchor=(0, 0), normalize=False, borderType=cv2.BORDER_CONSTANT
         ).reshape(count, height, width)[:, ::_CELL, ::_CELL]

@@ -21,18 +21,15 @@ from numpy.typing import NDArray
 
 from tk.kernels.mask_values import PERSON
 from tk.model.cameras.camera import Camera
+from tk.model.masks.silhouettes import SPECK_SHARE
 
 Float = NDArray[np.float64]
 Masks = NDArray[np.uint8]
 
-# Parts of a mask smaller than this share of the largest one are not the person. Half and twice the
-# value change no mean error of dance and cube (50 frames).
-_SPECK_SHARE = 0.1
 # Pixels of a mask's largest part, at least: a smaller one has no shape.
 _LEAST_PIXELS = 20
-# A pair is tested if the line through the centres is farther from the middle of the person than this many of the
-# person's greatest extents, as seen from either camera: half an extent would touch the silhouette. On the development
-# captures correct pairs have the same errors from 0.55 to 1; with 1, three times as many pairs cannot be tested.
+# Two cameras are tested if the line through their centres is farther from the middle of the person than this many of
+# the person's greatest extents, as seen from either camera: half an extent would touch the silhouette.
 _CLEAR_OF_LINE = 0.65
 # A tangent beyond this angle about the line is on its other side: the silhouettes have nothing in common.
 _OPPOSITE = np.pi / 2
@@ -65,7 +62,7 @@ class Outline:
         largest = max(areas, default=0.0)
         if largest < _LEAST_PIXELS:
             return None
-        parts = [contour[:, 0] for contour, area in zip(contours, areas, strict=True) if area >= _SPECK_SHARE * largest]
+        parts = [contour[:, 0] for contour, area in zip(contours, areas, strict=True) if area >= SPECK_SHARE * largest]
         pixels = np.concatenate(parts).astype(np.float64)
         corners = cv2.convexHull(camera.undistort(pixels).astype(np.float32), returnPoints=False)[:, 0]
         last = np.array([camera.width, camera.height]) - 1.0

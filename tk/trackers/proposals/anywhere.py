@@ -10,23 +10,22 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError
 from tk.kernels.mask_values import PERSON
 from tk.model.body import gait_poses as gait
+from tk.model.body.initial_pose import HEADINGS
+from tk.model.body.limb_candidates import DISTINCT_M
 from tk.model.cameras.camera import Rig
 from tk.model.masks.silhouettes import Pyramid
-from tk.trackers.hypotheses import SAME_START_M, different
+from tk.trackers.hypotheses import different
 
 if TYPE_CHECKING:
     from tk.trackers.contour_finder import ContourFinder, Seen
 
 Float = NDArray[np.float64]
 
-# Headings, and walking phases of each, from which the person is searched for.
-HEADINGS, PHASES = 8, 8
+# Walking phases at each heading from which the person is searched for.
+PHASES = 8
 # Of the poses that the coarsest scale gives, one in REFINED goes on to the finer ones; FINALISTS of those that differ
 # are proposed.
 REFINED, FINALISTS = 3, 4
-# A mask smaller than this share of the largest one does not show where the person is, because others hide most of the
-# person. A view from above, or from twice as far, shows a quarter.
-WHOLE = 0.1
 
 
 def propose(finder: ContourFinder, seen: Seen, pose: Float | None = None) -> Float:
@@ -52,23 +51,24 @@ def propose(finder: ContourFinder, seen: Seen, pose: Float | None = None) -> Flo
         poses = finder.settle(pyramid, poses, levels).states
         order = np.argsort(seen.evidence.cost(finder.body, poses), kind="stable")
         poses = poses[order[: -(-len(poses) // share)]]
-    return np.asarray(poses[different(skeleton, poses, SAME_START_M)[:FINALISTS]])
+    return np.asarray(poses[different(skeleton, poses, DISTINCT_M)[:FINALISTS]])
 
 
 def centroid(rig: Rig, pyramid: Pyramid, index: int) -> Float:
     """Return (3,) the point nearest to the rays through the silhouettes' centroids, metres; ``index``: the frame's.
+
+    A silhouette counts by its area, because a small part of a person does not show where the person is.
 
     Raises:
         CaptureError: fewer than two cameras see anybody.
     """
     A, y, count = np.zeros((3, 3)), np.zeros(3), 0
     shown = [np.nonzero(mask >= PERSON) for mask in pyramid.masks[0]]
-    least = WHOLE * max(len(ys) for ys, _ in shown)
     for (ys, xs), camera in zip(shown, rig, strict=True):
-        if len(ys) <= least:
+        if not len(ys):
             continue
         ray = camera.rays([[xs.mean(), ys.mean()]])[0]
-        across = np.eye(3) - np.outer(ray, ray)
+        across = len(ys) * (np.eye(3) - np.outer(ray, ray))
         A += across
         y += across @ camera.center
         count += 1

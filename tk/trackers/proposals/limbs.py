@@ -22,15 +22,10 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 
 # Candidates of a limb that are refined; of a limb that is known to be misplaced; random candidates near its pose that
-# are screened beside the grid. With 3 and 8 refined candidates half as many more of the misplaced limbs stay misplaced
-# (scripts/search_recall.py).
+# are screened beside the grid.
 CANDIDATES, MORE_CANDIDATES, NEARBY = 8, 32, 80
-# Screening stops at a candidate of which this share lies outside the silhouettes. With 0.2 and 0.8 the mean errors
-# of dance and cube (60 frames) change by less than 0.05 cm.
+# Screening stops at a candidate of which this share lies outside the silhouettes.
 OUTSIDE = 0.4
-# A mode is not proposed if it costs so much more than the present pose, nats. With four views this is a cost of 0.01,
-# as chosen before.
-PROMISING = 2.5
 # Poses that are proposed, at most.
 FINISHED = 2
 # Other poses of a limb that are kept for the second pass.
@@ -93,7 +88,7 @@ def propose(finder: ContourFinder, seen: Seen, pose: Float, found: Sequence[Mode
     Args:
         finder, seen, pose, found: as for, and from, :func:`modes`.
     """
-    alone = [(one.limb.dofs, good) for one in found if len(good := one.poses[one.cost < PROMISING][:2])]
+    alone = [(one.limb.dofs, one.poses[:2]) for one in found if len(one.poses)]
     result = [one for _, poses in alone for one in poses]
     for i, (_, first) in enumerate(alone):
         for dofs, second in alone[i + 1 :]:
