@@ -318,23 +318,30 @@ class _Finisher:
         return retimed_landmarks(self.task.setup.rig.reduced_pixels(found), draft.result.frames, late)
 
     def _with_cameras(self, draft: Draft, rig: Rig, late: NDArray[np.int64]) -> tuple[Draft, list[str]] | None:
-        """Return a draft with other cameras, and without delays, (C,) frames, and lines for the user. The person is
-        tracked again if there are delays or a camera was left out of many frames; None if the first pass explains the
-        images better.
+        """Return a draft with other cameras, and without delays, (C,) frames, and lines for the user; None if the first
+        pass explains the images better.
 
-        With several people, the pixels of each are known with the delays only. A source that cannot be read again is
-        not tracked again.
+        If there are delays, all poses are optimised with the synchronised masks. The person is tracked again if that
+        does not explain the images better, or if a camera was left out of many frames. With several people, the pixels
+        of each are known with the delays only. A source that cannot be read again is not tracked again.
         """
         task, result, (tracker, masks) = self.task, draft.result, draft.used
         now = tracker.with_cameras(rig), retimed(masks, result.frames, late)
         again = replace(draft.copy(), tracker=now[0], masks=now[1])
-        first = Run.of(draft.used, result.frames, draft, np.flatnonzero(result.status != Status.ABSENT))
-        out = first.left_out()
+        present = np.flatnonzero(result.status != Status.ABSENT)
+        first = Run.of(draft.used, result.frames, draft, present)
+        out, seen = first.left_out(), self._landmarks(draft, late)
         source = task.source.shifted((np.array(task.source.time_offset_s) + late / task.setup.fps).tolist())
         if source is None or source.frame_count is None or not (self.alone if late.any() else out.any()):
             return again, []
+        if not out.any():
+            pose, residual = draft.current("pose"), draft.current("residual")
+            shown = now[1].sequence(result.frames)
+            poses, residuals = now[0].following(shown, pose, draft.lost, residual, seen)
+            moved = replace(again.copy(), columns=again.columns | {"pose": poses, "residual": residuals})
+            if explains_better(Run.of(now, result.frames, moved, present), first):
+                return moved, []
         _LOG.info("tracking again with the refined cameras")
-        seen = self._landmarks(draft, late)
         landmarks = {} if seen is None else dict(zip(result.frames.tolist(), seen, strict=True))
         landmarks = {frame: own for frame, own in landmarks.items() if np.isfinite(own).any()}
         done = track_again(first, now, source, task.setup, draft.member.subject, landmarks, self.within)

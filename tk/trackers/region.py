@@ -517,6 +517,19 @@ class RegionTracker(ContourTracker[RegionState]):
         views = view_variance(rays, np.where(used[..., None], shares, 0.0), self.view_m)
         return np.asarray((noise + views) * variance_factor(residual)[..., None])
 
+    def following(
+        self,
+        masks: Sequence[NDArray[np.uint8]],
+        poses: Float,
+        lost: NDArray[np.bool_],
+        residual: Float,
+        landmarks: Float | None = None,
+    ) -> tuple[Float, Float]:
+        """See :class:`~tk.trackers.protocol.TwoPassTracker`."""
+        again = SecondPass(self, masks, landmarks, self.world.poses_in(poses), lost, residual, lambda _: None)
+        again.follow()
+        return np.where(lost[:, None], poses, self.world.poses_out(again.poses)), again.residual
+
     def second_pass(
         self,
         masks: Sequence[NDArray[np.uint8]],
