@@ -22,6 +22,7 @@ from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import AVERAGE_BODY
 from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.initial_pose import GREATEST_STATURE, LEAST_STATURE
+from tk.model.body.joints import HIPS, JOINTS, SHOULDERS
 from tk.model.body.skeleton import Skeleton
 from tk.model.cues.ray_costs import Evidence
 from tk.model.masks.silhouettes import Pyramid
@@ -53,6 +54,8 @@ EXPLAINS_NOTHING = 0.6
 # Alternatives that are followed through the opening, the likeliest of each anchor first: where nothing fits, each takes
 # seconds. Half and twice as many change no mean error of dance and cube (50 frames).
 FOLLOWED = 8
+#: the joints that a limb search does not move
+TRUNK = [JOINTS.index(name) for name in ("pelvis", "neck", *SHOULDERS, *HIPS)]
 # A search that finds a better pose is repeated, at most this often.
 _SEARCHES = 2
 
@@ -131,6 +134,10 @@ def _find(finder: ContourFinder, seen: Seen) -> tuple[float, Float]:
     both = [opposite.propose(finder, seen, pose, range(finder.solver.scales)[::-1]) for pose in found[:OPPOSITE]]
     found = np.concatenate([found, *both])
     found = found[different(skeleton, found, SAME_START_M)]
+    # a limb search moves limbs only: it brings a pose to where it brings a likelier one with the same trunk
+    before, trunk = seen.evidence.cost(finder.body, found), skeleton.joints(found)[:, TRUNK]
+    alike = np.linalg.norm(trunk[:, None] - trunk[None], axis=-1).max(axis=-1) < SAME_START_M
+    found = found[~(alike & (before[:, None] > before + DROPPED)).any(axis=1)]
     poses = np.array([_searched(finder, seen, pose) for pose in found])
     cost = seen.evidence.cost(finder.body, poses)
     order = np.argsort(cost, kind="stable")
