@@ -81,7 +81,7 @@ def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None 
     least = np.inf
     for anchor in np.unique(np.linspace(0, len(seen) - 1, ANCHORS).astype(int)):
         try:
-            residual, poses = _find(finder, seen[anchor])
+            residual, poses = _find(finder, seen[anchor], alone=len(seen) == 1)
         except CaptureError:
             if anchor == 0:
                 raise
@@ -126,18 +126,20 @@ def _contains(skeleton: Skeleton, hypotheses: Sequence[TrajectoryHypothesis], fr
     return any(skeleton.apart(hypothesis.poses[frame], joints) < SAME_START_M for hypothesis in hypotheses)
 
 
-def _find(finder: ContourFinder, seen: Seen) -> tuple[float, Float]:
+def _find(finder: ContourFinder, seen: Seen, alone: bool) -> tuple[float, Float]:
     """Return the residual (E_S) of the best pose in a frame, and poses (B, D): the best one, then those that are not
-    improbable beside it."""
+    improbable beside it; ``alone``: no other frame follows, which would correct the limbs."""
     skeleton = finder.body.skeleton
     found = np.concatenate([anywhere.propose(finder, seen), landmarks.propose(finder, seen)])
     both = [opposite.propose(finder, seen, pose, range(finder.solver.scales)[::-1]) for pose in found[:OPPOSITE]]
     found = np.concatenate([found, *both])
     found = found[different(skeleton, found, SAME_START_M)]
-    # a limb search moves limbs only: it brings a pose to where it brings a likelier one with the same trunk
+    # A limb search moves limbs only: it brings a pose to where it brings a likelier one with the same trunk, within 2
+    # nats on three recordings. A pose of a single frame gets 0.6 cm worse by that.
     before, trunk = seen.evidence.cost(finder.body, found), skeleton.joints(found)[:, TRUNK]
     alike = np.linalg.norm(trunk[:, None] - trunk[None], axis=-1).max(axis=-1) < SAME_START_M
-    found = found[~(alike & (before[:, None] > before + DROPPED)).any(axis=1)]
+    if not alone:
+        found = found[~(alike & (before[:, None] > before + DROPPED)).any(axis=1)]
     poses = np.array([_searched(finder, seen, pose) for pose in found])
     cost = seen.evidence.cost(finder.body, poses)
     order = np.argsort(cost, kind="stable")
