@@ -18,13 +18,15 @@ import math
 from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.io.captures.capture import Capture
 from tk.io.captures.frames import FrameSet
 from tk.model.masks.foreground import CollinearityForeground
 from tk.model.masks.learned_scene import LearnedScene
@@ -152,7 +154,7 @@ class LearnedMasks:
             return _Span(begin, stop, None, ())
         if self._next != begin:
             self._open.close()
-            self._reading = self._open.enter_context(self._source.frames(begin, self._source.frame_count))
+            self._reading = self._open.enter_context(self._samples_from(begin))
         for frame in self._reading:
             if frame.index in chosen:
                 images.append(frame.images.copy())
@@ -163,6 +165,14 @@ class LearnedMasks:
         foreground = self._foreground(images, samples)
         checked = tuple(_checked(foreground, *pair) for pair in zip(images, samples, strict=True))
         return _Span(begin, stop, foreground, checked)
+
+    def _samples_from(self, begin: int) -> AbstractContextManager[Iterator[FrameSet]]:
+        """Return the samples of the spans from frame ``begin`` on; with all frames between them if the source cannot
+        leave them out."""
+        if not isinstance(self._source, Capture):
+            return self._source.frames(begin, self._source.frame_count)
+        spans = pairwise(self._edges[bisect_left(self._edges, begin) :])
+        return self._source.some_frames([index for span in spans for index in self._chosen(*span)])
 
     def _next_sample(self, images: Masks, before: Sequence[Segmented]) -> Segmented:
         """Ask for a sample after others: the people of the last one are expected to have moved on."""

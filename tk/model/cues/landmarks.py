@@ -243,8 +243,10 @@ class LandmarkCue:
         """
         x = self._skeleton.points(poses, SEGMENT, self._place)
         each = np.broadcast_to(self._seen, (len(poses), *self._seen.shape[-3:]))
-        square = ((x - [triangulate_joints(self._rig, one)[0] for one in each]) ** 2).sum(axis=-1)
-        known = known_landmarks(each)
+        known, points = known_landmarks(each), np.full(x.shape, np.nan)
+        for b in np.flatnonzero(known.any(axis=(1, 2))):
+            points[b] = triangulate_joints(self._rig, each[b])[0]
+        square = ((x - points) ** 2).sum(axis=-1)
         visibility = np.where(known, each[..., 2], 0.0).sum(axis=-2) / np.maximum(known.sum(axis=-2), 1)
         expected = 3 * (deviation(visibility) * self._size) ** 2
         excess = right_share(visibility) * np.maximum(np.where(np.isfinite(square), square, 0.0) - expected, 0.0) / 6
