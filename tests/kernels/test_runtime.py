@@ -41,6 +41,17 @@ def test_starts_once_on_the_cpu_by_the_environment_and_says_nothing():
     assert run(STATE, TK_THREADS="1", TK_DEBUG="1") == ["True", "True", "1", "False"]
 
 
+def test_starting_asks_no_server():
+    code = """
+        import threading, urllib.request
+        urllib.request.urlopen = lambda *_, **__: print("asked")
+        from tk.kernels.runtime import ensure_runtime
+        ensure_runtime()
+        [thread.join(5) for thread in threading.enumerate() if thread.daemon]
+    """
+    assert run(code) == []
+
+
 def test_leaves_the_callers_runtime_alone():
     printed = run(
         """

@@ -129,9 +129,13 @@ def test_cameras_that_were_moved_are_not_compared(tiny: Path, tmp_path: Path, mo
     assert (seen[0] == [True, False, True, True]).all()
 
 
-def test_late_videos_are_tracked_again(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("better", [[True], [False, True]])
+def test_late_videos_are_tracked_again_unless_the_poses_follow(
+    better: list[bool], tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With invented delays: which frames are tracked again, and that every frame keeps its row."""
     asked: list[np.ndarray] = []
+    again = len(better) > 1
 
     def made_up(people: Any, rig: Rig, *_: Any) -> Any:
         return BetterCameras(rig, np.array([0.0, 0.0, 1.0, -1.0]), "refined")
@@ -143,12 +147,12 @@ def test_late_videos_are_tracked_again(tiny: Path, tmp_path: Path, monkeypatch: 
         return read(capture, *more)
 
     monkeypatch.setattr(finish, "refine_if_inconsistent", made_up)
-    monkeypatch.setattr(finish, "explains_better", lambda *_: True)
+    monkeypatch.setattr(finish, "explains_better", lambda *_: better.pop(0))
     monkeypatch.setattr(Capture, "frames", remember)
     path, reporter = tmp_path / "again.h5", Silent()
     assert track(open_capture(tiny), path, settings_file.from_toml(QUICK), reporter, frames=(2, None)).lost == 0
-    assert [late.tolist() for late in asked] == [[0, 0, 0, 0], [0, 0, 1, -1]]
-    assert any("tracking again" in note for note in reporter.notes)
+    assert [late.tolist() for late in asked] == [[0, 0, 0, 0], [0, 0, 1, -1]][: 1 + again]
+    assert any("tracking again" in note for note in reporter.notes) == again
     result = read_result(path)
     assert result.frames.tolist() == list(range(2, FRAMES)) and (result.status != Status.LOST).all()
     assert result.cameras is not None

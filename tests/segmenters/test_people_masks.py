@@ -226,3 +226,55 @@ def test_specks_that_no_other_camera_shows_are_removed() -> None:
     spoilt = masks.copy()
     spoilt[0, 10:20, 140:150] = spoilt[2, 190:196, 4:20] = 255
     np.testing.assert_array_equal(masks_of(OneOfMany()).without_specks(spoilt), masks)
+
+
+class Standing(OneOfMany):
+    """Sees shoulders, hips and ankles of an upright person."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.searched = 0
+
+    def find(self, image: NDArray[np.uint8]) -> list[Sighting]:
+        self.searched += 1
+        return super().find(image)
+
+    def segment_pose(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        found, landmarks = self.segment(image), np.full((12, 3), np.nan)
+        y, x = np.nonzero(found > 0.5)
+        if len(x):
+            for row, share in ((0, 0.0), (6, 0.5), (10, 1.0)):
+                landmarks[row : row + 2] = x.mean(), y.min() + share * np.ptp(y), 0.9
+        return found, landmarks
+
+
+@pytest.mark.parametrize(
+    ("now", "searched", "asked"),
+    [
+        ([(0.25, 0.1)], 2, 4),  # every second image is searched for others
+        ([(0.6, 0.1)], 2, 8),  # some squares about the last place do not hold the person
+        ([(0.25, 0.1), (-0.6, -0.2)], 8, 20),
+        ([], 4, 4),
+    ],
+    ids=["there", "moved on", "a newcomer", "gone"],
+)
+def test_expected_people_are_not_detected_again(now: list[At], searched: int, asked: int) -> None:
+    places = masks_of(Standing()).label(shown([(0.2, 0.1)])[0]).places
+    assert places is not None and len(places) == 1
+    segmenter = Standing()
+    images, who = shown(now)
+    found = masks_of(segmenter).label(images, places)
+    assert segmenter.searched == searched and len(segmenter.seen) <= asked
+    for k in range(len(now)):
+        assert (found.masks > 0)[who == k + 1].mean() > 0.9, k
+    assert (found.masks > 0)[who == 0].mean() < 0.002
+
+
+def test_newcomer_is_found_by_the_other_half_of_the_cameras_in_the_next_turn() -> None:
+    segmenter = masks_of(Standing())
+    places = segmenter.label(shown([(0.2, 0.1)])[0]).places or ()
+    images, who = shown([(0.2, 0.1), (-0.6, -0.2)])
+    images[::2] = shown([(0.2, 0.1)])[0][::2]  # only the cameras 1 and 3 see the newcomer
+    for turn in (0, 1):
+        masks = segmenter.label(images, places, turn).masks
+        assert ((masks[1::2] > 0)[who[1::2] == 2].mean() > 0.9) == (turn == 1)

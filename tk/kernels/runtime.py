@@ -27,6 +27,8 @@ _LOG = logging.getLogger(__name__)
 # Without this Taichi prints a greeting on import; a library does not write to the user's stdout.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_LOG_LEVEL", "error")
+# Without this Taichi asks a server for its latest version, once a day, or at each start where there is no network.
+os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 
 
 def _choose_cache() -> None:

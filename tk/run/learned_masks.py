@@ -18,13 +18,15 @@ import math
 from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.io.captures.capture import Capture
 from tk.io.captures.frames import FrameSet
 from tk.model.masks.foreground import CollinearityForeground
 from tk.model.masks.learned_scene import LearnedScene
@@ -119,18 +121,22 @@ class LearnedMasks:
         before, after = span.around(frame.index) if span.samples else (None, None)
         asked = before is not None and before is after and before.index == frame.index
         if span.foreground is None or before is None or after is None:
-            whole = before.seen if before and asked else self._people.label(frame.images)
+            whole = before.seen if before and asked else self._seen(frame, before)
             kind = np.full(self._cameras, SEGMENTER, np.uint8)
             return whole.masks, whole.uncertain, kind, whole.landmarks, whole.people
         masks, uncertain = span.foreground.label(frame.images, frame.halved, _between(before, after))
         kind = np.full(self._cameras, LEARNED_AND_SEGMENTER if asked else LEARNED, np.uint8)
         failed, seen = ~(before.agrees & after.agrees), before.seen if asked else None
         if failed.any():
-            seen = seen or self._people.label(frame.images)
+            seen = seen or self._seen(frame, before)
             masks[failed], uncertain[failed] = seen.masks[failed], seen.uncertain[failed]
             kind[failed] = SEGMENTER
         masks = self._people.without_specks(masks)
         return masks, uncertain, kind, *((None, None) if seen is None else (seen.landmarks, seen.people))
+
+    def _seen(self, frame: FrameSet, near: _Sample | None) -> Segmented:
+        """Ask for a frame that is no sample; people are expected where the sample before it shows them."""
+        return self._people.label(frame.images, (near and near.seen.places) or (), frame.index)
 
     def _span_of(self, index: int) -> _Span:
         within = min(max(index, self._edges[0]), self._edges[-1] - 1)
@@ -148,11 +154,11 @@ class LearnedMasks:
             return _Span(begin, stop, None, ())
         if self._next != begin:
             self._open.close()
-            self._reading = self._open.enter_context(self._source.frames(begin, self._source.frame_count))
+            self._reading = self._open.enter_context(self._samples_from(begin))
         for frame in self._reading:
             if frame.index in chosen:
                 images.append(frame.images.copy())
-                samples.append((frame.index, self._people.label(frame.images)))
+                samples.append((frame.index, self._next_sample(frame.images, [seen for _, seen in samples])))
             if frame.index + 1 >= stop:
                 break
         self._next = stop
@@ -160,12 +166,25 @@ class LearnedMasks:
         checked = tuple(_checked(foreground, *pair) for pair in zip(images, samples, strict=True))
         return _Span(begin, stop, foreground, checked)
 
+    def _samples_from(self, begin: int) -> AbstractContextManager[Iterator[FrameSet]]:
+        """Return the samples of the spans from frame ``begin`` on; with all frames between them if the source cannot
+        leave them out."""
+        if not isinstance(self._source, Capture):
+            return self._source.frames(begin, self._source.frame_count)
+        spans = pairwise(self._edges[bisect_left(self._edges, begin) :])
+        return self._source.some_frames([index for span in spans for index in self._chosen(*span)])
+
+    def _next_sample(self, images: Masks, before: Sequence[Segmented]) -> Segmented:
+        """Ask for a sample after others: the people of the last one are expected to have moved on."""
+        last, earlier = ([seen.places or () for seen in reversed(before)] + [(), ()])[:2]
+        return self._people.label(images, [place.ahead(earlier) for place in last], len(before))
+
     def _follow(self, frame: FrameSet) -> _Span:
         """Ask for the masks of a frame of a source of unknown length if the last time is long ago; return what is
         learned so far, with the last sample."""
         if frame.index < self._span.stop:
             return self._span
-        sample = (frame.index, self._people.label(frame.images))
+        sample = (frame.index, self._next_sample(frame.images, [seen for _, (_, seen) in self._past]))
         self._past.append((frame.images.copy(), sample))
         self._asked += 1
         foreground = self._span.foreground

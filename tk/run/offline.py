@@ -316,23 +316,31 @@ class _Finisher:
         return {landmarks.NAME: retimed_measured(found, draft.result.frames, late)}
 
     def _with_cameras(self, draft: Draft, rig: Rig, late: NDArray[np.int64]) -> tuple[Draft, list[str]] | None:
-        """Return a draft with other cameras, and without delays, (C,) frames, and lines for the user. The person is
-        tracked again if there are delays or a camera was left out of many frames; None if the first pass explains the
-        images better.
+        """Return a draft with other cameras, and without delays, (C,) frames, and lines for the user; None if the first
+        pass explains the images better.
 
-        With several people, the pixels of each are known with the delays only. A source that cannot be read again is
-        not tracked again.
+        If there are delays, all poses are optimised with the synchronised masks. The person is tracked again if that
+        does not explain the images better, or if a camera was left out of many frames. With several people, the pixels
+        of each are known with the delays only. A source that cannot be read again is not tracked again.
         """
         task, result, (tracker, masks) = self.task, draft.result, draft.tracker_and_masks
         now = tracker.with_cameras(rig), retimed(masks, result.frames, late)
         again = replace(draft.copy(), tracker=now[0], masks=now[1])
-        first = Run.of(draft.tracker_and_masks, result.frames, draft, np.flatnonzero(result.status != Status.ABSENT))
-        out = first.left_out()
+        present = np.flatnonzero(result.status != Status.ABSENT)
+        first = Run.of(draft.tracker_and_masks, result.frames, draft, present)
+        out, measured = first.left_out(), self._measured(draft, late)
         source = task.source.shifted((np.array(task.source.time_offset_s) + late / task.setup.fps).tolist())
         if source is None or source.frame_count is None or not (self.alone if late.any() else out.any()):
             return again, []
+        if not out.any():
+            pose, residual = draft.current("pose"), draft.current("residual")
+            shown = now[1].sequence(result.frames)
+            poses, residuals = now[0].following(shown, pose, draft.lost, residual, measured)
+            moved = replace(again.copy(), columns=again.columns | {"pose": poses, "residual": residuals})
+            if explains_better(Run.of(now, result.frames, moved, present), first):
+                return moved, []
         _LOG.info("tracking again with the refined cameras")
-        seen = self._measured(draft, late).get(landmarks.NAME, ())
+        seen = measured.get(landmarks.NAME, ())
         marked = {n: own for n, own in zip(result.frames.tolist(), seen, strict=False) if np.isfinite(own).any()}
         done = track_again(first, now, source, task.setup, draft.person.subject, marked, self.within)
         if done is None:

@@ -19,6 +19,9 @@ one person if a square shows several, and misses people whom others hide. The ca
 The mask of a camera is the union of the people's masks. A segmenter that cannot detect people gets the part of the
 image that shows the volume, and must find everybody in it.
 
+Where people are known to be, from a frame shortly before, no detection is needed: the segmenter gets the squares around
+them at once, and again where these do not hold them. Only then, in the images without them, others are searched for.
+
 No state is kept between frames, so a resumed run sees the same masks.
 """
 
@@ -34,7 +37,7 @@ from numpy.typing import NDArray
 
 from tk.model.body.body_points import LANDMARKS
 from tk.model.cameras.camera import Rig
-from tk.model.cameras.landmark_agreement import associated, consensus
+from tk.model.cameras.landmark_agreement import Consensus, associated, consensus
 from tk.model.cameras.volume import Volume
 from tk.model.hull.coarse import CoarseHull
 from tk.model.masks.sightings import Patch, SeenPerson, Sighting, locate, volume_patch
@@ -74,12 +77,14 @@ class _Person:
         patches: one per camera.
         masks, uncertain: (C, H, W) uint8, 0 or 255, and bool.
         landmarks: (C, L, 4), see :mod:`tk.model.cues.landmarks`; NaN where there are none.
+        agreement: which cameras' landmarks agree; None if it is not known yet.
     """
 
     patches: list[Patch]
     masks: Images
     uncertain: Bool
     landmarks: NDArray[np.float64]
+    agreement: Consensus | None = None
 
 
 class Segmented(NamedTuple):
@@ -91,12 +96,14 @@ class Segmented(NamedTuple):
         landmarks: (N, C, L, 4) of each of N people's landmarks in each image, see
             :data:`~tk.model.body.body_points.LANDMARKS`; NaN where an image shows none.
         people: (C, H, W) uint8, bit n: the mask of person n shows the pixel. Of the first eight people.
+        places: where the people are; None if that is unknown of one of them.
     """
 
     masks: Images
     uncertain: Bool
     landmarks: NDArray[np.float64]
     people: Images
+    places: tuple[SeenPerson, ...] | None = None
 
 
 class PeopleMasks:
@@ -116,18 +123,28 @@ class PeopleMasks:
         """
         return self.label(images).masks
 
-    def label(self, images: Images) -> Segmented:
-        """Return what the segmenter sees in images (C, H, W, 3); see :meth:`segment`."""
+    def label(self, images: Images, expected: Sequence[SeenPerson] = (), turn: int = 0) -> Segmented:
+        """Return what the segmenter sees in images (C, H, W, 3); see :meth:`segment`.
+
+        Args:
+            images: the frame set.
+            expected: where people are expected. If all of them are there, every second camera is searched for others,
+                and the rest if it shows somebody.
+            turn: the first of these cameras, modulo two.
+        """
         masks, bits = np.zeros((2, *images.shape[:3]), np.uint8)
         uncertain = np.zeros(images.shape[:3], np.bool_)
-        people = self._people(images)
+        people = self._people(images, expected, turn)
         for n, person in enumerate(people):
             masks |= person.masks
             bits |= person.masks & np.uint8(1 << n if n < 8 else 0)
             uncertain |= person.uncertain
         shape = len(people), len(images), len(LANDMARKS), 4
         landmarks = np.array([person.landmarks for person in people]).reshape(shape)
-        return Segmented(masks, uncertain & (masks == 0), associated(self._rig, landmarks), bits)
+        places = [SeenPerson.at(self._agreement(person).points) for person in people]
+        known = tuple(place for place in places if place is not None)
+        landmarks = associated(self._rig, landmarks)
+        return Segmented(masks, uncertain & (masks == 0), landmarks, bits, known if len(known) == len(people) else None)
 
     def without_specks(self, masks: Images) -> Images:
         """Return masks (C, H, W) without small parts that no other camera shows: shadows, reflections."""
@@ -136,27 +153,36 @@ class PeopleMasks:
         hull = self._hull.everybody(masks)
         return np.stack([self._hull.only(hull, c, mask, _SPECK) for c, mask in enumerate(masks)])
 
-    def _people(self, images: Images) -> list[_Person]:
+    def _people(self, images: Images, expected: Sequence[SeenPerson], turn: int) -> list[_Person]:
         if not isinstance(self._segmenter, Finder):
             everybody = self._empty(self._whole)
             for c in range(len(images)):
                 self._segment(images, c, everybody)
             self._compare(images, everybody, range(len(images)))
             return [everybody]
-        left = images.copy()
+        left, every = images.copy(), range(len(images))
         people: list[_Person] = []
+        for place in expected:
+            if person := self._followed(left, place):
+                people.append(person)
+                self._paint_over(left, person)
+        all_there = bool(expected) and len(people) == len(expected)
         sightings: list[list[Sighting]] = [[] for _ in self._rig]
+        cameras = list(every)[turn % 2 :: 2] if all_there else list(every)
         for _ in range(_ROUNDS):
-            for c, each in enumerate(sightings):
-                each += self._sightings(left, c)
+            for c in cameras:
+                sightings[c] += self._sightings(left, c)
+            if any(sightings) and len(cameras) < len(images):
+                for c in set(every) - set(cameras):
+                    sightings[c] += self._sightings(left, c)
+            cameras = list(every)
             located, sightings = locate(self._rig, self._volume, sightings)
             new = [person for seen in located if (person := self._look(left, seen, people))]
             if not new:
                 break
             people += new
             for person in new:
-                for c in range(len(left)):
-                    self._paint(left[c], c, person.masks[c], person.patches[c])
+                self._paint_over(left, person)
         self._separate(images, people)
         return people + self._alone(images, people, sightings)
 
@@ -182,6 +208,25 @@ class PeopleMasks:
         moved = [Sighting((s.center[0] + x, s.center[1] + y), (s.top[0] + x, s.top[1] + y), s.score) for s in found]
         return [s for s in moved if np.isfinite(s.radius)]
 
+    def _followed(self, left: Images, place: SeenPerson) -> _Person | None:
+        """Return the masks of a person who is expected at a place; None if no two images show anybody there.
+
+        Where the square does not hold the sphere around the person, the segmenter gets the right one.
+        """
+        person, cameras = self._empty(self._patches(place)), range(len(left))
+        for c in cameras:
+            self._segment(left, c, person)
+        here = SeenPerson.at(self._agreement(person).points)
+        if here is None:
+            return None
+        for c, better in zip(cameras, self._patches(here), strict=True):
+            if not person.patches[c].fits(better, _BALL_MARGIN, _TOO_LARGE):
+                self._ask_again(left, c, person, better)
+        self._compare(left, person, cameras)
+        if SeenPerson.at(self._agreement(person).points) is None:
+            return None
+        return self._carved(person)
+
     def _patches(self, person: SeenPerson) -> list[Patch]:
         patches = [person.patch(camera, _BALL_MARGIN) for camera in self._rig]
         return [patch or whole for patch, whole in zip(patches, self._whole, strict=True)]
@@ -198,9 +243,13 @@ class PeopleMasks:
             if c not in seen.cameras:
                 self._segment(left, c, person)
         self._compare(left, person, range(len(left)))
+        return self._carved(person)
+
+    def _carved(self, person: _Person) -> _Person:
+        """Return the person without the regions of the masks that are away from the hull."""
         hull = self._by_all(person)
-        for c in range(len(left)):
-            person.masks[c] = self._hull.only(hull, c, person.masks[c])
+        for c, mask in enumerate(person.masks):
+            person.masks[c] = self._hull.only(hull, c, mask)
         return person
 
     def _compare(self, images: Images, person: _Person, cameras: Sequence[int]) -> None:
@@ -214,7 +263,7 @@ class PeopleMasks:
     def _better(self, person: _Person, c: int) -> Patch | None:
         """Return the square of a person in an image that follows from what the cameras show: where the landmarks of two
         agree, from their points, else from the hull of the other cameras' masks. None if the present one is good."""
-        agree, points, _ = consensus(self._rig, person.landmarks)
+        agree, points, _ = self._agreement(person)
         if (seen := SeenPerson.at(points)) is not None:
             return None if agree[c] else seen.patch(self._rig[c], _BALL_MARGIN)
         patch, others = person.patches[c], self._hull.subject(person.masks, np.arange(len(self._rig)) != c)
@@ -227,7 +276,7 @@ class PeopleMasks:
 
     def _by_all(self, person: _Person) -> Bool:
         """Return (N,) the voxels of a person's hull, by the cameras whose landmarks do not show somebody else."""
-        agree = consensus(self._rig, person.landmarks).agree
+        agree = self._agreement(person).agree
         unknown = ~np.isfinite(person.landmarks[..., 0]).any(axis=1)
         return self._hull.subject(person.masks, agree | unknown if agree.any() else ~agree)
 
@@ -259,6 +308,11 @@ class PeopleMasks:
                 person.uncertain[c] |= (found > _UNCERTAIN) & near
                 person.masks[c][(found > 0.5) & near] = 255
 
+    def _paint_over(self, images: Images, person: _Person) -> None:
+        """Paint a person over in images (C, H, W, 3)."""
+        for c, image in enumerate(images):
+            self._paint(image, c, person.masks[c], person.patches[c])
+
     def _paint(self, image: Images, c: int, mask: Images, patch: Patch) -> None:
         """Paint a mask (H, W) over in an image (H, W, 3), with the mean colour of the other pixels."""
         width = 2 * max(round(_RIM * patch.side), 1) + 1
@@ -281,18 +335,24 @@ class PeopleMasks:
     def _take(self, person: _Person, c: int, landmarks: NDArray[np.float64]) -> bool:
         """Replace a person's landmarks in an image, unless the cameras then agree less, or there are none any more: the
         network shows somebody else, or nobody. Return whether they were replaced."""
-        before, earlier = consensus(self._rig, person.landmarks).support, person.landmarks[c].copy()
+        before, earlier = self._agreement(person), person.landmarks[c].copy()
         if np.isnan(landmarks).all() and not np.isnan(earlier).all():
             return False
-        person.landmarks[c] = landmarks
-        if consensus(self._rig, person.landmarks).support < before:
-            person.landmarks[c] = earlier
+        person.landmarks[c], person.agreement = landmarks, None
+        if self._agreement(person).support < before.support:
+            person.landmarks[c], person.agreement = earlier, before
             return False
         return True
+
+    def _agreement(self, person: _Person) -> Consensus:
+        """Return which cameras' landmarks of a person agree."""
+        person.agreement = person.agreement or consensus(self._rig, person.landmarks)
+        return person.agreement
 
     def _segment(self, images: Images, c: int, person: _Person) -> None:
         """Give the segmenter the square of a person in an image; replace the mask and the landmarks."""
         found, person.landmarks[c] = self._seen(images[c], c, person.patches[c])
+        person.agreement = None
         self._put(person, c, found)
 
     @staticmethod

@@ -22,6 +22,7 @@ from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import AVERAGE_BODY
 from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.initial_pose import GREATEST_STATURE, LEAST_STATURE
+from tk.model.body.joints import HIPS, JOINTS, SHOULDERS
 from tk.model.body.limb_candidates import DISTINCT_M
 from tk.model.body.skeleton import Skeleton
 from tk.model.cues.ray_costs import Evidence
@@ -43,6 +44,8 @@ ANCHORS, CLEAR = 4, 0.2
 # Alternatives that are followed through the opening, the likeliest of each anchor first: where nothing fits, each takes
 # seconds.
 FOLLOWED = 8
+#: the joints that a limb search does not move
+TRUNK = [JOINTS.index(name) for name in ("pelvis", "neck", *SHOULDERS, *HIPS)]
 
 
 def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None = None) -> list[TrajectoryHypothesis]:
@@ -66,7 +69,7 @@ def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None 
     least = np.inf
     for anchor in np.unique(np.linspace(0, len(seen) - 1, ANCHORS).astype(int)):
         try:
-            residual, poses = _find(finder, seen[anchor])
+            residual, poses = _find(finder, seen[anchor], alone=len(seen) == 1)
         except CaptureError:
             if anchor == 0:
                 raise
@@ -108,14 +111,20 @@ def _contains(skeleton: Skeleton, hypotheses: Sequence[TrajectoryHypothesis], fr
     return any(skeleton.apart(hypothesis.poses[frame], joints) < DISTINCT_M for hypothesis in hypotheses)
 
 
-def _find(finder: ContourFinder, seen: Seen) -> tuple[float, Float]:
+def _find(finder: ContourFinder, seen: Seen, alone: bool) -> tuple[float, Float]:
     """Return the residual (E_S) of the best pose in a frame, and poses (B, D): the best one, then those that are not
-    improbable beside it."""
+    improbable beside it; ``alone``: no other frame follows, which would correct the limbs."""
     skeleton = finder.body.skeleton
     found = np.concatenate([anywhere.propose(finder, seen), landmarks.propose(finder, seen)])
     both = [opposite.propose(finder, seen, pose, range(finder.solver.scales)[::-1]) for pose in found[:OPPOSITE]]
     found = np.concatenate([found, *both])
     found = found[different(skeleton, found, DISTINCT_M)]
+    # A limb search moves limbs only: it brings a pose to where it brings a likelier one with the same trunk. A pose of
+    # a single frame gets worse by that.
+    before, trunk = seen.evidence.cost(finder.body, found), skeleton.joints(found)[:, TRUNK]
+    alike = np.linalg.norm(trunk[:, None] - trunk[None], axis=-1).max(axis=-1) < DISTINCT_M
+    if not alone:
+        found = found[~(alike & (before[:, None] > before + DROPPED)).any(axis=1)]
     poses = np.array([finder.improved(seen, pose) for pose in found])
     cost = seen.evidence.cost(finder.body, poses)
     order = np.argsort(cost, kind="stable")

@@ -289,6 +289,20 @@ class TwoPassTracker(Tracker, Protocol):
         """Return a pose (D,) with the opposite heading and the limbs in the same places."""
         ...
 
+    def following(
+        self,
+        masks: Sequence[NDArray[np.uint8]],
+        poses: Float,
+        lost: NDArray[np.bool_],
+        residual: Float,
+        measured: Measured | None = None,
+    ) -> tuple[Float, Float]:
+        """Optimise every frame by itself, from poses that other cameras, or masks of other instants, have given.
+
+        Arguments as for :meth:`second_pass`; return poses (F, D) and residuals (F, C, 2).
+        """
+        ...
+
     def second_pass(
         self,
         masks: Sequence[NDArray[np.uint8]],

@@ -495,6 +495,20 @@ class RegionTracker(ContourTracker[RegionState]):
         noise = pose_variance(self.body.skeleton, pose, covariance)
         return np.asarray(noise * variance_factor(residual)[..., None])
 
+    def following(
+        self,
+        masks: Sequence[NDArray[np.uint8]],
+        poses: Float,
+        lost: NDArray[np.bool_],
+        residual: Float,
+        measured: Measured | None = None,
+    ) -> tuple[Float, Float]:
+        """See :class:`~tk.trackers.protocol.TwoPassTracker`."""
+        inside = self.world.poses_in(poses)
+        again = SecondPass(self, masks, measured or {}, None, inside, lost, residual, lambda _: None)
+        again.follow()
+        return np.where(lost[:, None], poses, self.world.poses_out(again.poses)), again.residual
+
     def second_pass(
         self,
         masks: Sequence[NDArray[np.uint8]],

@@ -161,6 +161,16 @@ class SecondPass:
             self.poses[frames] = settled.states
             self._advance(len(frames))
 
+    def follow(self) -> None:
+        """Optimise every frame by itself from its pose of the first pass, which other cameras have given; give each its
+        residual."""
+        for frames in _chunks(self.tracked):
+            for level in (LEVEL, 0):
+                seen = Pyramid.of_all([self._pyramid(i, LEVEL + 1) for i in frames], level)
+                self.poses[frames] = self.tracker.settle(seen, self.poses[frames], (level,)).states
+            label = self.tracker.coarse_grid.render(self.tracker.body, self.poses[frames]).label
+            self.residual[frames] = self._residual(seen, label)
+
     def smooth(self) -> None:
         """Optimise all frames together, each near its present pose and coupled to its neighbours by the motion; give
         each its residual and its variance."""
@@ -199,10 +209,14 @@ class SecondPass:
         """Set the residuals and the variances of frames, whose poses have covariances (N, D, D)."""
         tracker, seen, poses = self.tracker, self._together(frames), self.poses[frames]
         label = tracker.coarse_grid.render(tracker.body, poses).label
-        sampled = tracker.coarse_grid.sample(seen.masks[0]).reshape(label.shape)
-        self.residual[frames] = residual = residual_of(label > 0, sampled >= PERSON, sampled == OTHERS)
+        self.residual[frames] = residual = self._residual(seen, label)
         variance = tracker.variance(poses, covariance, residual)
         self._variance[0, frames] = variance + tracker.contradiction(seen, poses)
+
+    def _residual(self, seen: Pyramid, label: NDArray[np.uint8]) -> Float:
+        """Return the residuals (N, C, 2) of bodies, labels (N, C, h, w), in N frames at the finest scale."""
+        sampled = self.tracker.coarse_grid.sample(seen.masks[0]).reshape(label.shape)
+        return residual_of(label > 0, sampled >= PERSON, sampled == OTHERS)
 
     def decide(self) -> None:
         """Track other poses of the limbs in both directions, and replace the present ones where these are likelier;

@@ -125,7 +125,7 @@ def test_dimension_rows_equal_finite_differences():
 def test_landmark_rows_equal_finite_differences():
     mean = FAMILY.mean
     shared = mean + np.random.default_rng(3).normal(0, 0.02, len(mean)) * (FAMILY.deviation > 1e-5)
-    rows = FAMILY.landmark_rows(shared, POSE)
+    rows = FAMILY.landmark_rows(shared, POSE[None])[0]
     assert rows.shape == (len(LANDMARKS), 3, len(mean))
     for k, step in enumerate(1e-5 * np.eye(len(mean))):
         pair = [body_points(FAMILY.build(shared + sign * step), POSE) for sign in (1, -1)]

@@ -7,7 +7,6 @@ along an occluding contour the surface slides in the image's tangent only.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,7 +18,7 @@ from tk.kernels.silhouette import Edgels
 from tk.model.body.anthropometry import DIMENSIONS, UPRIGHT, BodyDimensions
 from tk.model.body.body_points import SEGMENT, places
 from tk.model.body.cone_body import SHAPE_NUMBERS, ConeBody, ConePart, build_cone_body, group_of, part_arrays
-from tk.model.body.skeleton import build_skeleton
+from tk.model.body.skeleton import Skeleton, build_skeleton
 
 Float = NDArray[np.float64]
 
@@ -92,31 +91,48 @@ class BodyFamily:
         """
         body = self.build(shared)
         s = body.skeleton
-        others = BodyDimensions.of(np.exp(shared[: len(DIMENSIONS)] + _STEP * np.eye(len(DIMENSIONS))))
+        others = BodyDimensions.of(np.exp(self._around(shared)[1:]))
         shape, T = body.reshape(*part_arrays(others), self._change(shared))
         by_part = (_part_numbers(shape, s.in_world(T)) - _part_numbers(body.shape, body.frames[1])) / _STEP
-        changed = build_skeleton(others)
-        point, rise = (changed.point - s.point) / _STEP, (changed.rise - s.rise) / _STEP
-        moves = s.segment_moves(poses, point, rise)
+        moves = self._segment_moves(shared, poses)[1]
         twists = np.concatenate(s.twists(poses), axis=-1).swapaxes(-1, -2)
         return LinearisedBody(body, s.segment_transforms(poses), twists, by_part.transpose(1, 2, 0), moves)
 
-    def landmark_rows(self, shared: Float, pose: Float) -> Float:
-        """Return the derivatives (L, 3, K) of the points that landmarks mark by the parameters (K,), at a pose (D,)."""
-        return self._rows(shared, lambda d: build_skeleton(d).points(pose, SEGMENT, places(d)))
+    def landmark_rows(self, shared: Float, poses: Float) -> Float:
+        """Return the derivatives (F, L, 3, K) of the points that landmarks mark by the parameters (K,), at poses
+        (F, D)."""
+        each = [places(BodyDimensions.of(one)) for one in np.exp(self._around(shared))]
+        return self._rows(shared, poses, SEGMENT, (np.array(each[1:]) - each[0]) / _STEP)
 
     def joint_rows(self, shared: Float, poses: Float) -> Float:
         """Return the derivatives (F, J, 3, K) of the joints by the parameters (K,), at poses (F, D)."""
-        return self._rows(shared, lambda d: build_skeleton(d).joints(poses))
+        skeleton = build_skeleton(BodyDimensions.of(np.exp(self._around(shared))))
+        here, *others = skeleton.joint_position
+        return self._rows(shared, poses, skeleton.joint_segment, (np.array(others) - here) / _STEP)
 
-    def _rows(self, shared: Float, points: Callable[[BodyDimensions], Float]) -> Float:
-        """Return the derivatives (..., K) of points that depend on the dimensions by the parameters (K,)."""
-        logarithms = shared[: len(DIMENSIONS)]
-        now = points(BodyDimensions.of(np.exp(logarithms)))
-        rows = np.zeros((*now.shape, len(shared)))
-        for k, step in enumerate(_STEP * np.eye(len(DIMENSIONS))):
-            rows[..., k] = (points(BodyDimensions.of(np.exp(logarithms + step))) - now) / _STEP
+    def _rows(self, shared: Float, poses: Float, segment: NDArray[np.int32], moved: Float) -> Float:
+        """Return the derivatives (F, N, 3, K) of points of the segments (N,) by the parameters (K,), at poses (F, D).
+
+        ``moved``: (24, N, 3) derivatives of their places in the zero configuration.
+        """
+        skeleton, moves = self._segment_moves(shared, poses)
+        inside = skeleton.segment_transforms(poses)[:, segment, :3, :3] @ moved.transpose(1, 2, 0)
+        rows = np.zeros((*inside.shape[:3], len(shared)))
+        rows[..., : len(DIMENSIONS)] = moves[:, segment] + inside
         return rows
+
+    @staticmethod
+    def _around(shared: Float) -> Float:
+        """Return the dimensions' logarithms (25, 24): those in parameters (K,), and with a step of each."""
+        return shared[: len(DIMENSIONS)] + _STEP * np.eye(len(DIMENSIONS) + 1, len(DIMENSIONS), -1)
+
+    def _segment_moves(self, shared: Float, poses: Float) -> tuple[Skeleton, Float]:
+        """Return the skeleton with parameters (K,), and the derivatives (F, S, 3, 24) of its segments' places by the
+        dimensions, at poses (F, D)."""
+        skeleton = build_skeleton(BodyDimensions.of(np.exp(shared[: len(DIMENSIONS)])))
+        changed = build_skeleton(BodyDimensions.of(np.exp(self._around(shared)[1:])))
+        point, rise = (changed.point - skeleton.point) / _STEP, (changed.rise - skeleton.rise) / _STEP
+        return skeleton, skeleton.segment_moves(poses, point, rise)
 
     def add_prior(self, shared: Float, H: Float, g: Float) -> None:
         """Add the prior at parameters (K,) to their normal equations (K, K), (K,)."""

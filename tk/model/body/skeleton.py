@@ -258,8 +258,14 @@ class Skeleton:
     def point_jacobian(self, poses: Float, segment: NDArray[np.int32], points: Float) -> Float:
         """Return the derivatives (..., N, 3, D) of :meth:`points` (..., N, 3) at poses (..., D)."""
         w, v = self.twists(poses)
-        moved = cross(w[..., None, :, :], points[..., None, :]) + v[..., None, :, :]
-        return np.swapaxes(moved * self.ancestors[segment][:, :, None], -1, -2)
+        generators = np.zeros((*w.shape, 4))  # ω × x + v of (x, 1)
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            generators[..., i, j], generators[..., i, k] = -w[..., k], w[..., j]
+        generators[..., 3] = v
+        flat = generators.reshape(*w.shape[:-2], -1, 4)
+        moved = flat[..., :3] @ np.swapaxes(points, -1, -2) + flat[..., 3:]  # (..., 3 D, N)
+        moved = moved.reshape(*w.shape, -1) * self.ancestors[segment].T[:, None]
+        return np.moveaxis(moved, -1, -3).swapaxes(-1, -2)
 
     @cached_property
     def ancestors(self) -> NDArray[np.bool_]:

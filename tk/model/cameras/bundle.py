@@ -201,20 +201,22 @@ class ContourBundle:
                 columns = [slice(0, D), slice(own, own + k), slice(D + S - K, D + S)]
                 rows = np.hstack([by_pose[i:j], *by_camera, by_body[i:j]])
                 found.add(view.frame, columns, rows, self._information * view.edgels.weight, view.edgels.distance)
-        # offsets of landmarks are the same in all frames, so that many frames say as much as one
-        seen = 1.0 / max(sum(MARKED in frame.pyramid.measured for frame in self.frames), 1)
+        marked = [f for f, frame in enumerate(self.frames) if MARKED in frame.pyramid.measured]
+        if marked:
+            # a network's depth is too cautious, by an unknown share: it says nothing about the body's lengths
+            seen = np.array([self.frames[f].pyramid.measured[MARKED] for f in marked])
+            seen[..., 3] = np.nan
+            said = LandmarkCue(state.rig, linear.body, seen).rows(state.poses[marked])
+            by_body = self.family.landmark_rows(state.body, state.poses[marked])
+            unknowns = np.concatenate([np.arange(P), np.arange(D + S - K, D + S)])
+            # offsets of landmarks are the same in all frames, so that many frames say as much as one
+            normal = said.normal_equations(np.concatenate([said.jacobian, by_body], axis=-1))
+            for f, hessian, gradient in zip(marked, *normal, strict=True):
+                found.add_normal(f, unknowns, hessian / len(marked), gradient / len(marked))
         precision = np.full(D, POSE_DEVIATION**-2.0)
         precision[P:] = (self._segment_m or 1.0) ** -2.0
         for f, (frame, pose) in enumerate(zip(self.frames, state.poses, strict=True)):
             difference, excess = np.zeros(D), np.zeros(D)
-            if (marked := frame.pyramid.measured.get(MARKED)) is not None:
-                # a network's depth is too cautious, by an unknown share: it says nothing about the body's lengths
-                seen_px = np.where(np.arange(4) < 3, marked, np.nan)
-                said = LandmarkCue(state.rig, linear.body, seen_px).rows(pose[None])
-                by_body = self.family.landmark_rows(state.body, pose)
-                hessian, gradient = said.normal_equations(np.concatenate([said.jacobian, by_body[None]], axis=-1))
-                unknowns = np.concatenate([np.arange(P), np.arange(D + S - K, D + S)])
-                found.add_normal(f, unknowns, seen * hessian[0], seen * gradient[0])
             difference[:P] = np.where(s.is_straight, 0.0, frame.pose) - pose
             excess[:P] = s.clip(pose) - pose
             found.add_block_prior(f, precision, difference)

@@ -85,14 +85,21 @@ _MIDDLE = {"pelvis": HIPS, "neck": SHOULDERS, "head_top": _FACE}
 _MARKED = {joint: [LANDMARKS.index(name) for name in _MIDDLE.get(joint, (joint,))] for joint in JOINTS}
 
 
-class _Likelihood(NamedTuple):
-    """The landmarks' likelihood at B poses."""
+class _Match(NamedTuple):
+    """N measurements, of landmarks or of depths, in the V images, compared with B poses: each as it is named, and with
+    left and right exchanged. All arrays are (B, 2, V, N).
 
-    cost: Float  # (B,) its negative logarithm, if all landmarks were independent
-    # (B, L + K, 3, 3), (B, L + K, 3) information about each body point and each bone; and its product with the
-    # distance to the landmarks
-    information: Float
-    pull: Float
+    Attributes:
+        ratio: likelihood, relative to that of a wrong measurement.
+        right: probability that it is right.
+        weight: 1/variance, 1/m².
+        away: distances, metres; one array per axis.
+    """
+
+    ratio: Float
+    right: Float
+    weight: Float
+    away: tuple[Float, ...]
 
 
 class LandmarkRows(NamedTuple):
@@ -159,6 +166,35 @@ class LandmarkCue:
         """(V, 3, 3), (V, 3) from the world to each camera."""
         return np.array([c.rotation for c in self._rig]), np.array([c.translation for c in self._rig])
 
+    @cached_property
+    def _marks(self) -> tuple[Float, Float, Float, Float]:
+        """(..., 2, V, L) x and y on the plane at distance 1, probability of being right, and 1/variance, 1/m², of the
+        landmarks as named, and with left and right exchanged."""
+        values = (self._at[..., 0], self._at[..., 1], self._right, self._sigma**-2)
+        x, y, right, weight = (np.stack([value, value[..., _PARTNER]], axis=-3) for value in values)
+        return x, y, right, weight
+
+    @cached_property
+    def _depths(self) -> tuple[Float, Float, Float]:
+        """(..., 2, V, K) depths of the bones, metres, probability of being right, and 1/variance, 1/m², as named, and
+        with left and right exchanged."""
+        depth, visibility = (np.stack([v, v[..., _PARTNER]], axis=-3) for v in (self._depth, self._visibility))
+        seen = self._size * (depth[..., _TO] - depth[..., _FROM])
+        known, visibility = np.isfinite(seen), np.minimum(visibility[..., _TO], visibility[..., _FROM])
+        sigma = self._widened * DEPTH_M * self._size * DEPTH_HIDDEN ** (1.0 - visibility)
+        return np.where(known, seen, 0.0), np.where(known, right_share(visibility), 0.0), sigma**-2
+
+    @cached_property
+    def _directions(self) -> tuple[Float, Float]:
+        """(4 V, 9), (..., V, 9) what the information about a point is linear in: see :meth:`_information`."""
+        x, y, z = np.swapaxes(self._cameras[0], 0, 1)  # (V, 3) each
+
+        def product(a: Float, b: Float) -> Float:
+            return (a[..., :, None] * b[..., None, :]).reshape(*a.shape[:-1], 9)
+
+        across = [product(x, x) + product(y, y), -product(x, z) - product(z, x), -product(y, z) - product(z, y)]
+        return np.concatenate([*across, product(z, z)]), product(self._sight, self._sight)
+
     def normal(self, poses: Float) -> Quadratic:
         """Return the negative logarithm of the likelihood, and of the prior of the angles that only landmarks show, as
         a quadratic about each of the poses (B, D), nats."""
@@ -170,11 +206,10 @@ class LandmarkCue:
     def rows(self, poses: Float) -> LandmarkRows:
         """Return the information of the landmarks about the body's points at poses (B, D)."""
         x = self._skeleton.points(poses, SEGMENT, self._place)
-        found = self._likelihood(x)
-        spread = np.eye(3) + self._offset[..., None, None] * found.information
-        information = INDEPENDENT * np.linalg.solve(spread, found.information)
-        pull = INDEPENDENT * np.linalg.solve(spread, found.pull[..., None])[..., 0]
-        return LandmarkRows(np.asarray(information), np.asarray(pull), self._skeleton.point_jacobian(poses, SEGMENT, x))
+        found, pull = self._information(x)[1:]
+        inverse = INDEPENDENT * _inverse(np.eye(3) + self._offset[..., None, None] * found)[0]
+        jacobian = self._skeleton.point_jacobian(poses, SEGMENT, x)
+        return LandmarkRows(inverse @ found, (inverse @ pull[..., None])[..., 0], jacobian)
 
     def cost(self, poses: Float) -> Float:
         """Return (B,) the same at poses (B, D), nats, up to a constant of the frame.
@@ -182,14 +217,15 @@ class LandmarkCue:
         The offsets are integrated out by Laplace's method, about the offsets that one step of Newton's gives. They
         explain what all images have in common; a landmark far off in one image is not explained by them.
         """
-        x = self._skeleton.points(poses, SEGMENT, self._place)
-        found, variance = self._likelihood(x), self._offset[..., : len(LANDMARKS), None]
-        spread = np.eye(3) + variance[..., None] * found.information[:, : len(LANDMARKS)]
-        offset = variance * np.linalg.solve(spread, found.pull[:, : len(LANDMARKS), :, None])[..., 0]
-        moved = self._likelihood(x + offset).cost + 0.5 * (offset**2 / variance).sum(axis=(-2, -1))
-        volume = 0.5 * np.log(np.linalg.det(spread)).sum(axis=-1)
+        x, L = self._skeleton.points(poses, SEGMENT, self._place), len(LANDMARKS)
+        cost, information, pull = self._information(x)
+        variance = self._offset[..., :L, None]
+        inverse, determinant = _inverse(np.eye(3) + variance[..., None] * information[:, :L])
+        offset = variance * (inverse @ pull[:, :L, :, None])[..., 0]
+        moved = self._likelihood(x + offset)[0] + 0.5 * (offset**2 / variance).sum(axis=(-2, -1))
+        volume = 0.5 * np.log(determinant).sum(axis=-1)
         # where the step leaves a landmark's normal part, it is too long, and no offset is better
-        cost = INDEPENDENT * (np.minimum(moved, found.cost) + volume)
+        cost = INDEPENDENT * (np.minimum(moved, cost) + volume)
         return np.asarray(cost + 0.5 * (self._prior * poses**2).sum(axis=-1))
 
     def variance(self, poses: Float) -> Float:
@@ -201,86 +237,91 @@ class LandmarkCue:
         """
         x = self._skeleton.points(poses, SEGMENT, self._place)
         each = np.broadcast_to(self._seen, (len(poses), *self._seen.shape[-3:]))
-        square = ((x - [triangulate_joints(self._rig, one)[0] for one in each]) ** 2).sum(axis=-1)
-        known = known_landmarks(each)
+        known, points = known_landmarks(each), np.full(x.shape, np.nan)
+        for b in np.flatnonzero(known.any(axis=(1, 2))):
+            points[b] = triangulate_joints(self._rig, each[b])[0]
+        square = ((x - points) ** 2).sum(axis=-1)
         visibility = np.where(known, each[..., 2], 0.0).sum(axis=-2) / np.maximum(known.sum(axis=-2), 1)
         expected = 3 * (deviation(visibility) * self._size) ** 2
         excess = right_share(visibility) * np.maximum(np.where(np.isfinite(square), square, 0.0) - expected, 0.0) / 6
         return np.stack([excess[:, rows].mean(axis=1) for rows in _MARKED.values()], axis=1)
 
-    def _likelihood(self, x: Float) -> _Likelihood:
+    def _information(self, x: Float) -> tuple[Float, Float, Float]:
+        """Return the landmarks' likelihood if the body's points are at x (B, L, 3): its negative logarithm (B,), if all
+        landmarks were independent; the information (B, L + K, 3, 3) about each point and each bone, and its product
+        (B, L + K, 3) with the distance to the landmarks.
+
+        An image shows a point's position across the ray: with the point at (u, v) on the plane at distance 1, the
+        derivatives are the rows (1, 0, -u) and (0, 1, -v) in the camera's frame.
+        """
+        (B, L, _), V = x.shape, len(self._rig)
+        cost, q, marks, depths, named = self._likelihood(x)
+        w = named @ _HALVES * marks.right * marks.weight  # (B, 2, V, L)
+        u, v = q[:, :, 0] / q[:, :, 2], q[:, :, 1] / q[:, :, 2]
+        total, (pull_x, pull_y) = w.sum(axis=1), ((w * away).sum(axis=1) for away in marks.away)
+        moments = np.stack([total, total * u, total * v, total * (u * u + v * v)], axis=1)  # (B, 4, V, L)
+        across, along = self._directions
+        information = np.swapaxes(moments.reshape(B, 4 * V, L), 1, 2) @ across
+        pulls = np.stack([pull_x, pull_y, -u * pull_x - v * pull_y], axis=2).reshape(B, 3 * V, L)
+        pull = np.swapaxes(pulls, 1, 2) @ self._cameras[0].reshape(3 * V, 3)
+        w = named @ _BONE_HALVES * depths.right * depths.weight  # (B, 2, V, K)
+        bones = np.swapaxes(w.sum(axis=1), 1, 2) @ along
+        bone_pull = np.swapaxes((w * depths.away[0]).sum(axis=1), 1, 2) @ self._sight
+        information = np.concatenate([information, bones], axis=1).reshape(B, -1, 3, 3)
+        return cost, information, np.concatenate([pull, bone_pull], axis=1)
+
+    def _likelihood(self, x: Float) -> tuple[Float, Float, _Match, _Match, Float]:
+        """Return the negative logarithm (B,) of :meth:`_information`; the points (B, V, 3, L) in the cameras' frames,
+        with a depth of 1 behind a camera; what landmarks and depths are compared with; and the probability
+        (B, 2, V, halves) that an image shows the person with each half as named, and exchanged."""
+        (B, L, _), V = x.shape, len(self._rig)
         rotation, translation = self._cameras
-        q = np.einsum("vij,blj->bvli", rotation, x) + translation[:, None]
-        ahead = q[..., 2] > 0.1
-        depth = np.where(ahead, q[..., 2], 1.0)
-        ray = q[..., :2] / depth[..., None]
-        own, own_right, own_r, own_sigma = self._match(ray, depth, ahead, None)
-        other, other_right, other_r, other_sigma = self._match(ray, depth, ahead, _PARTNER)
-        bones = _with_bones(x)[:, len(LANDMARKS) :]
-        along, along_right, along_r, along_sigma = self._match_depth(bones, None)
-        turned, turned_right, turned_r, turned_sigma = self._match_depth(bones, _PARTNER)
-        # (2, B, V, halves)
-        halves = np.stack([
-            own @ _HALVES.T + along @ _BONE_HALVES.T,
-            other @ _HALVES.T + turned @ _BONE_HALVES.T,
-        ])  # fmt: skip
-        halves += np.log([1.0 - EXCHANGED, EXCHANGED])[:, None, None, None]
-        total = np.logaddexp(*halves)
-        as_named = np.exp(halves[0] - total)  # (B, V, halves)
-        straight, straight_bone = as_named @ _HALVES, as_named @ _BONE_HALVES  # (B, V, L), (B, V, K)
-        image = total.sum(axis=-1) + np.log(1.0 - ELSEWHERE)  # (B, V)
+        q = (rotation.reshape(3 * V, 3) @ np.swapaxes(x, 1, 2)).reshape(B, V, 3, L) + translation[:, :, None]
+        behind = q[:, :, 2] <= 0.1
+        q[:, :, 2][behind] = 1.0
+        marks, depths = self._match(q, behind), self._match_depth(_with_bones(x)[:, L:])
+        halves = np.stack(
+            [
+                np.prod(marks.ratio[..., points], axis=-1) * np.prod(depths.ratio[..., bones], axis=-1)
+                for points, bones in zip(_HALVES > 0, _BONE_HALVES > 0, strict=True)
+            ],
+            axis=-1,
+        )  # (B, 2, V, halves)
+        halves *= np.array([1.0 - EXCHANGED, EXCHANGED])[:, None, None]
+        total = halves.sum(axis=1)
+        image = np.log(total).sum(axis=-1) + np.log(1.0 - ELSEWHERE)  # (B, V)
         image_total = np.logaddexp(image, self._elsewhere)
-        shown = np.exp(image - image_total)[..., None]
-        w_own = shown * straight * own_right / own_sigma**2
-        w_other = shown * (1 - straight) * other_right / other_sigma**2
-        # rows of the derivative of the position across the ray, metres, by the point
-        P = rotation[:, None, :2] - ray[..., :, None] * rotation[:, None, 2:]  # (B, V, L, 2, 3)
-        weighted = (w_own + w_other)[..., None, None] * P
-        information = np.einsum("bvlai,bvlaj->blij", weighted, P)
-        pull = np.einsum("bvla,bvlai->bli", w_own[..., None] * own_r + w_other[..., None] * other_r, P)
-        w_along = shown * straight_bone * along_right / along_sigma**2
-        w_turned = shown * (1 - straight_bone) * turned_right / turned_sigma**2
-        a = np.broadcast_to(self._sight, (len(x), *self._sight.shape[-2:]))  # (B, V, 3)
-        information = np.concatenate([information, np.einsum("bvk,bvi,bvj->bkij", w_along + w_turned, a, a)], axis=1)
-        pull = np.concatenate([pull, np.einsum("bvk,bvi->bki", w_along * along_r + w_turned * turned_r, a)], axis=1)
-        return _Likelihood(-image_total.sum(axis=-1), information, pull)
+        named = halves / total[:, None] * np.exp(image - image_total)[:, None, :, None]
+        return -image_total.sum(axis=-1), q, marks, depths, named
 
-    def _match(
-        self, ray: Float, depth: Float, ahead: NDArray[np.bool_], order: NDArray[np.int64] | None
-    ) -> tuple[Float, Float, Float, Float]:
-        """Compare the landmarks, taken in an order, with the projected points.
-
-        Returns:
-            The logarithm of each landmark's likelihood, the probability that it is right, (B, V, L), its distance
-            (B, V, L, 2) and standard deviation, metres.
-        """
-        at, sigma, right = self._at, self._sigma, self._right
-        if order is not None:
-            at, sigma, right = at[..., order, :], sigma[..., order], right[..., order]
-        r = (at - ray) * depth[..., None]
-        right = np.where(ahead, right, 0.0)
-        inside = right / (2 * np.pi * sigma**2) * np.exp(-0.5 * (r**2).sum(axis=-1) / sigma**2)
+    def _match(self, q: Float, behind: NDArray[np.bool_]) -> _Match:
+        """Compare the landmarks with points (B, V, 3, L) in the cameras' frames, of which some are ``behind``
+        (B, V, L)."""
+        x, y, right, weight = self._marks
+        right = np.where(behind[:, None], 0.0, right)
+        q_x, q_y, depth = (q[:, None, :, axis] for axis in range(3))
+        away = x * depth - q_x, y * depth - q_y
+        inside = right * weight / (2 * np.pi) * np.exp(-0.5 * weight * (away[0] ** 2 + away[1] ** 2))
         both = inside + (1.0 - right) * WRONG_DENSITY
-        return np.log(both / WRONG_DENSITY), inside / both, r, np.broadcast_to(sigma, both.shape)
+        return _Match(both / WRONG_DENSITY, inside / both, weight, away)
 
-    def _match_depth(self, bones: Float, order: NDArray[np.int64] | None) -> tuple[Float, Float, Float, Float]:
-        """Compare the depths of bones (B, K, 3), as :func:`_with_bones` has them, with the landmarks in an order.
-
-        Returns:
-            As :meth:`_match`, (B, V, K).
-        """
-        depth, visibility = self._depth, self._visibility
-        if order is not None:
-            depth, visibility = depth[..., order], visibility[..., order]
-        seen = self._size * (depth[..., _TO] - depth[..., _FROM])
-        known = np.isfinite(seen)
-        visibility = np.minimum(visibility[..., _TO], visibility[..., _FROM])
-        right = np.where(known, right_share(visibility), 0.0)
-        sigma = self._widened * DEPTH_M * self._size * DEPTH_HIDDEN ** (1.0 - visibility)
-        r = np.where(known, seen, 0.0) - np.einsum("...vi,...ki->...vk", self._sight, bones)
-        inside = right / (np.sqrt(2 * np.pi) * sigma) * np.exp(-0.5 * (r / sigma) ** 2)
+    def _match_depth(self, bones: Float) -> _Match:
+        """Compare the depths with bones (B, K, 3), as :func:`_with_bones` has them."""
+        seen, right, weight = self._depths
+        away = seen - (self._sight @ np.swapaxes(bones, 1, 2))[:, None]
+        inside = right * np.sqrt(weight / (2 * np.pi)) * np.exp(-0.5 * weight * away**2)
         both = inside + (1.0 - right) * WRONG_DENSITY
-        return np.log(both / WRONG_DENSITY), inside / both, r, np.broadcast_to(sigma, both.shape)
+        return _Match(both / WRONG_DENSITY, inside / both, weight, (away,))
+
+
+def _inverse(matrix: Float) -> tuple[Float, Float]:
+    """Return the inverse (..., 3, 3) and the determinant (...) of symmetric matrices (..., 3, 3)."""
+    a, b, c, d, e, f = (matrix[..., i, k] for i in range(3) for k in range(i, 3))
+    rows = d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b
+    determinant = a * rows[0] + b * rows[1] + c * rows[2]
+    order = [0, 1, 2, 1, 3, 4, 2, 4, 5]
+    inverse = np.stack([rows[k] for k in order], axis=-1) / determinant[..., None]
+    return inverse.reshape(matrix.shape), determinant
 
 
 def _with_bones(values: Float) -> Float:

@@ -12,7 +12,6 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-import scipy  # its packages are imported when they are first used
 from numpy.typing import NDArray
 
 from tk.model.cameras.camera import Rig
@@ -174,10 +173,10 @@ class CoarseHull:
 
     def _agreed(self, masks: NDArray[np.uint8], cameras: Bool, wrong: int) -> Bool:
         hull, agreeing = self._in_most(masks, cameras, wrong)
-        objects, count = scipy.ndimage.label(hull.reshape(self._grid.shape), np.ones((3, 3, 3)))
+        label = regions(hull.reshape(self._grid.shape)).reshape(-1)
+        count = int(label.max())
         if count == 0:
             return hull
-        label = objects.reshape(-1)
         # a region that only two cameras see may be larger than the person, whom more of them see
         sizes = np.array(
             [np.bincount(label[hull & (agreeing >= n)], minlength=count + 1) for n in range(2, len(masks) + 1)]
@@ -219,6 +218,35 @@ class CoarseHull:
             return away > 0
         distance = cv2.distanceTransform(away, cv2.DIST_L2, 3)
         return np.asarray(distance <= _NEAR_VOXELS * self._voxels.pixels_per_voxel[c])
+
+
+def regions(voxels: Bool) -> NDArray[np.int32]:
+    """Return the number of the region, from 1, of each of the voxels (X, Y, Z) that are True, else 0. Voxels are
+    connected by faces, edges and corners. (`scipy.ndimage.label`, which takes 0.4 s to import.)"""
+    result = np.zeros(voxels.shape, np.int32)
+    if not voxels.any():
+        return result
+    others = [tuple(np.delete(range(3), axis)) for axis in range(3)]
+    spans = [np.flatnonzero(voxels.any(axis=axes))[[0, -1]] for axes in others]
+    box = tuple(slice(int(first), int(last) + 1) for first, last in spans)
+    label, count = result[box], 0
+    for layer, plane in zip(label, np.ascontiguousarray(voxels[box]).view(np.uint8), strict=True):
+        found, numbers = cv2.connectedComponents(plane, connectivity=8, ltype=cv2.CV_32S)
+        layer[...] = np.where(np.asarray(numbers) > 0, np.asarray(numbers) + count, 0)
+        count += found - 1
+    _, Y, Z = label.shape
+    padded = np.pad(label[1:], ((0, 0), (1, 1), (1, 1)))
+    pairs = set()
+    for y, z in np.ndindex(3, 3):
+        above, below = label[:-1], padded[:, y : y + Y, z : z + Z]
+        both = (above > 0) & (below > 0)
+        pairs |= set(zip(above[both].tolist(), below[both].tolist(), strict=True))
+    number = np.arange(count + 1)
+    for one, other in sorted(pairs):
+        low, high = sorted((int(number[one]), int(number[other])))
+        number[number == high] = low
+    label[...] = np.unique(number, return_inverse=True)[1][label]
+    return result
 
 
 def dilated(mask: NDArray, by: int) -> Bool:

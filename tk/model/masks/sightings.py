@@ -7,7 +7,7 @@ Sightings of one person in several images are matched where their lines of sight
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import cv2
@@ -73,6 +73,12 @@ class Patch:
         """Return whether all points (N, 2) lie in it."""
         return bool((np.abs((points - np.array(self.center)) @ _turn(self.angle)) <= self.side / 2).all())
 
+    def fits(self, other: Patch, margin: float, too_large: float) -> bool:
+        """Return whether it serves in place of a square that is larger than a person by the factor ``margin``: it holds
+        the circle around the person, and is larger than the other square by the factor ``too_large`` at most."""
+        circle = np.array(other.center) + other.side / (2 * margin) * np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
+        return self.side <= too_large * other.side and self.holds(circle)
+
     def cut(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return its pixels (side, side, 3) of an image (h, w, 3); black beyond the image."""
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -117,6 +123,15 @@ class SeenPerson:
         reach = float(np.nanmax(np.linalg.norm(points - hips, axis=1)))
         along = (shoulders - hips) / np.linalg.norm(shoulders - hips)
         return SeenPerson(hips, hips + reach * along, reach, ())
+
+    def ahead(self, before: Sequence[SeenPerson]) -> SeenPerson:
+        """Return where the person is after the time that has passed since people were at the places ``before``, if the
+        person moves on as from the nearest of them; one who is not within the radius is somebody else."""
+        steps = [self.center - person.center for person in before]
+        step = min(steps, key=lambda step: float(np.linalg.norm(step)), default=np.zeros(3))
+        if np.linalg.norm(step) > self.radius_m:
+            return self
+        return replace(self, center=self.center + step, top=self.top + step)
 
     def patch(self, camera: Camera, margin: float) -> Patch | None:
         """Return the square about the sphere in an image, the body upright in it, larger by the factor ``margin``.
