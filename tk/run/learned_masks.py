@@ -158,7 +158,8 @@ class LearnedMasks:
         for frame in self._reading:
             if frame.index in chosen:
                 images.append(frame.images.copy())
-                samples.append((frame.index, self._next_sample(frame.images, [seen for _, seen in samples])))
+                seen = self._next_sample(frame.images, [seen for _, seen in samples], len(samples))
+                samples.append((frame.index, seen))
             if frame.index + 1 >= stop:
                 break
         self._next = stop
@@ -174,17 +175,19 @@ class LearnedMasks:
         spans = pairwise(self._edges[bisect_left(self._edges, begin) :])
         return self._source.some_frames([index for span in spans for index in self._chosen(*span)])
 
-    def _next_sample(self, images: Masks, before: Sequence[Segmented]) -> Segmented:
-        """Ask for a sample after others: the people of the last one are expected to have moved on."""
+    def _next_sample(self, images: Masks, before: Sequence[Segmented], turn: int) -> Segmented:
+        """Ask for a sample after others: the people of the last one are expected to have moved on. ``turn``: number of
+        the sample."""
         last, earlier = ([seen.places or () for seen in reversed(before)] + [(), ()])[:2]
-        return self._people.label(images, [place.ahead(earlier) for place in last], len(before))
+        return self._people.label(images, [place.ahead(earlier) for place in last], turn)
 
     def _follow(self, frame: FrameSet) -> _Span:
         """Ask for the masks of a frame of a source of unknown length if the last time is long ago; return what is
         learned so far, with the last sample."""
         if frame.index < self._span.stop:
             return self._span
-        sample = (frame.index, self._next_sample(frame.images, [seen for _, (_, seen) in self._past]))
+        before = [seen for _, (_, seen) in self._past]
+        sample = (frame.index, self._next_sample(frame.images, before, self._asked))
         self._past.append((frame.images.copy(), sample))
         self._asked += 1
         foreground = self._span.foreground
