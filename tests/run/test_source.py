@@ -370,6 +370,11 @@ def test_a_run_with_somebody_who_enters_later_is_resumed(
         np.testing.assert_array_equal(one.frames, other.frames[:end])
         np.testing.assert_array_equal(one.pose, other.pose[:end])
         np.testing.assert_array_equal(one.status, other.status[:end])
+        # what was said before the stop, and after it
+        assert [note for note in one.notes if "entered" in note or "awaited" in note] == [
+            "person 1 is not in the working volume in frame 0, and is awaited",
+            "frame 10: person 1 has entered",
+        ]
 
 
 def test_attempts_to_track_somebody_who_is_refused_are_twice_as_far_apart_each_time(

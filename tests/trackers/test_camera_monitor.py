@@ -25,6 +25,7 @@ from tk.model.cameras.common_view import LEAST_INFORMATION, depth_information
 from tk.model.masks.mask_agreement import Agreement
 from tk.model.setup import Subject
 from tk.trackers.camera_monitor import CameraMonitor, MonitorState, opening_agreement
+from tk.trackers.judgement import FAULTS, STATES
 from tk.trackers.protocol import Estimate, Frame
 from tk.trackers.reason import Reason, report_frames
 from tk.trackers.region import RegionTracker
@@ -204,6 +205,28 @@ def test_frozen_and_black_cameras_are_excluded_and_reported(scene: Scene) -> Non
     assert scene.error(estimates, range(FRAMES)) < 0.10
     lines = " | ".join(monitor.report())
     assert "cam1 stands still" in lines and "cam4 shows nothing: left out of frames 8 to 13" in lines
+
+
+@pytest.mark.parametrize("covered", [True, False], ids=["covered by a thing", "person out of view"])
+def test_camera_that_shows_nothing_of_the_person_is_reported(scene: Scene, covered: bool) -> None:
+    noise = np.random.default_rng(0)
+
+    def spoil(frame: Frame) -> Frame:
+        images, masks = frame.images.copy(), frame.masks.copy()
+        if frame.index >= 5:
+            masks[2] = 255 * covered
+            if covered:  # all of it has colours that are not the person's, and is in motion
+                images[2] = (0, 255, 0) + noise.integers(0, 2, (*images.shape[1:3], 1), np.uint8) * (255, -255, 0)
+        return replace(frame, images=images, masks=masks)
+
+    monitor, estimates, _ = scene.follow(spoil)
+    state, text = ("torn", FAULTS["torn"].text) if covered else ("unseen", FAULTS["unseen"].text)
+    for i, e in enumerate(estimates):
+        assert e.residual is not None and e.cameras is not None
+        assert np.isnan(e.residual[:, 0]).tolist() == [False, False, i >= 5, False]
+        assert [STATES[camera] for camera in e.cameras] == ["used", "used", state if i >= 5 else "used", "used"]
+    assert monitor.report() == [f"camera cam3 {text}: left out of frames 5 to {FRAMES - 1}"]
+    assert monitor.doubted.tolist() == [False, False, covered, False]
 
 
 @pytest.mark.parametrize("cameras", [[0, 1, 2, 3], [0, 1, 3]], ids=["no mask", "one mask"])

@@ -14,7 +14,7 @@ from tk.kernels.mask_values import OTHERS
 from tk.kernels.raycast import FAR
 from tk.model.cues.part_colors import RenderedBody, color_bins
 from tk.model.cues.ray_costs import RayGrid
-from tk.people.share import NOBODY, assign, enlarged
+from tk.people.share import NEAR_M, NOBODY, assign, enlarged
 from tk.trackers.protocol import Frame
 
 RIG = ring_of_cameras(4, width=160, height=200)
@@ -112,6 +112,19 @@ def test_each_pixel_is_evidence_for_one_of_two_people() -> None:
     shown = frame.masks > 0
     assert ((one == 255) ^ (other == 255))[shown].all() and (one[~shown] == 0).all()
     assert (np.where(one == 255, other, one)[shown] == OTHERS).all()
+
+
+def test_pixels_that_no_body_covers_are_evidence_for_everybody_in_reach() -> None:
+    """A limb of the one that is in a wrong place, near the other: it is found again only in these pixels."""
+    bodies, limb = [block(2, 10, 3.0), block(22, 30, 3.0)], block(10, 20, 3.0)
+    frame = masks_of(*bodies, limb)
+    found = assign(RIG, GRID, bodies, frame, stranger_share=2.0)
+    one, other = (GRID.sample(found.share(frame, person).masks)[:, 20] for person in (0, 1))
+    cell_m = 3.0 * GRID.step / RIG[0].matrix[0, 0]
+    middle, ends = slice(15, 17), round(NEAR_M / cell_m)
+    assert ends < 5 and (one[:, middle] == 255).all() and (other[:, middle] == 255).all()
+    assert (other[:, 10 : 10 + ends - 1] == OTHERS).all() and (other[:, 2:10] == OTHERS).all()
+    assert (one[:, 22:30] == OTHERS).all() and (GRID.sample(found.unknown(frame).masks)[:, 20, middle] == OTHERS).all()
 
 
 def test_pixels_far_from_all_bodies_belong_to_somebody_unknown() -> None:

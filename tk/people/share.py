@@ -8,6 +8,10 @@ into a graph cut. Each person is then tracked alone, with the pixels of the othe
 hidden, so a part costs nothing, and no contour is searched. Every pixel has one owner, also where two people are nearly
 as likely: in an embrace these are the arms, and without them the arms are not found. Somebody who has no body yet is
 unknown: pixels far from all bodies, and what has no colour of the bodies beside them.
+
+The bodies are where they are expected, and a limb may be elsewhere. Its pixels then belong to the body that happens to
+be nearest, so that the limb would never be found again. Therefore a pixel that no body covers is evidence for everybody
+in reach.
 """
 
 from __future__ import annotations
@@ -65,28 +69,36 @@ class PixelOwners:
     # (V, H, W) the number of a person, or `NOBODY` for somebody unknown; without meaning outside the masks
     owner: NDArray[np.int8]
     people: int  # number of people, also those whose body is unknown
+    # (V, h, w) bit k: no body covers the cell, and person k is in reach of it; see `share`
+    free: NDArray[np.uint32]
 
     def share(self, frame: Frame, person: int, unknown: bool = False) -> Frame:
         """Return the observation of a person, with the pixels of others as :data:`~tk.kernels.mask_values.OTHERS`.
 
+        A pixel that no body covers is nobody's for certain. It may show a limb that is in a wrong place, and counts for
+        everybody in reach: only the body that will cover it explains it.
+
         ``unknown``: pixels of somebody unknown may show this person.
         """
-        return replace(frame, masks=self._masks(frame, (person, NOBODY) if unknown else (person,)))
+        return replace(frame, masks=self._masks(frame, (person, NOBODY) if unknown else (person,), person))
 
     def unknown(self, frame: Frame) -> Frame:
         """Return the observation of people who are unknown; pixels of known people are
         :data:`~tk.kernels.mask_values.OTHERS`."""
         return replace(frame, masks=self._masks(frame, (NOBODY,)))
 
-    def _masks(self, frame: Frame, kept: Sequence[int]) -> NDArray[np.uint8]:
-        """Return a frame's masks; pixels of other owners than ``kept`` are OTHERS."""
+    def _masks(self, frame: Frame, kept: Sequence[int], person: int | None = None) -> NDArray[np.uint8]:
+        """Return a frame's masks; pixels of other owners than ``kept`` are OTHERS, unless free for a person."""
         masks = frame.masks.copy()
-        for mask, owner in zip(masks, self.owner, strict=True):
+        for mask, owner, free in zip(masks, self.owner, self.free, strict=True):
             x, y, w, h = cv2.boundingRect(mask)  # most of an image is background
             box = slice(y, y + h), slice(x, x + w)
             taken = mask[box] >= PERSON
             for number in kept:
                 taken &= owner[box] != number
+            if person is not None and free.any():
+                own = (free >> np.uint32(person) & np.uint32(1)).astype(np.uint8)
+                taken &= enlarged(own, self.grid.step, mask.shape)[box] == 0
             np.copyto(mask[box], OTHERS, where=taken)
         return masks
 
@@ -134,6 +146,7 @@ def assign(rig: Rig, grid: RayGrid, bodies: Sequence[RenderedBody | None], frame
     """
     shown = grid.sample(frame.masks) >= PERSON
     owner = np.full(frame.masks.shape, NOBODY, np.int8)
+    free = np.zeros(shown.shape, np.uint32)
     areas = [np.count_nonzero(body.label, axis=(1, 2)) for body in bodies if body is not None]
     least = STRANGER_SHARE * float(np.median(areas)) if areas else 0.0
     claims = _claims(grid, frame, bodies, shown)
@@ -153,8 +166,9 @@ def assign(rig: Rig, grid: RayGrid, bodies: Sequence[RenderedBody | None], frame
         view = _View(grid.step, shown[v][cells], [*shapes, *stranger], own)
         pixels = _pixels(cells, grid.step)
         image = crop(frame.images[v], frame.masks.shape[1:], *pixels) if colored else None
+        free[v][cells] = view.free()
         owner[v][pixels] = view.owners(frame.masks[v][pixels] >= PERSON, image)
-    return PixelOwners(grid, owner, len(bodies))
+    return PixelOwners(grid, owner, len(bodies), free)
 
 
 def _claims(grid: RayGrid, frame: Frame, bodies: Sequence[RenderedBody | None], shown: Bool) -> dict[int, Bool]:
@@ -230,6 +244,15 @@ class _View:
         for shape, visible in zip(shapes, self._visible, strict=True):
             if shape.number in claims:
                 visible += ratio * claims[shape.number]
+
+    def free(self) -> NDArray[np.uint32]:
+        """Return (h, w) the people in reach, as bits, of the cells that no shape covers."""
+        bare = self._shown & (_nearest(self._shapes) > NEAR_M)
+        found = np.zeros(bare.shape, np.uint32)
+        for shape in self._shapes if bare.any() else ():
+            if shape.number != NOBODY:
+                found |= (bare & (shape.away <= REACH_M)).astype(np.uint32) << np.uint32(shape.number)
+        return found
 
     def owners(self, person: Bool, image: NDArray[np.uint8] | None) -> NDArray[np.int8]:
         """Return (H, W) the owners of pixels, by the colours where the bodies alone do not decide.

@@ -42,6 +42,14 @@ _OPENING_BYTES = 4_000_000_000
 _ORIGIN = "run/"
 
 
+@dataclass(frozen=True)
+class RunState:
+    """What a resumed run needs: the people, and the notes for the user until now."""
+
+    people: PeopleState
+    said: list[str]
+
+
 @dataclass
 class Output:
     """The result file of a run.
@@ -49,11 +57,13 @@ class Output:
     Attributes:
         done: number of frames that an earlier run has finished.
         origin: what must agree with the earlier run.
+        said: the notes for the user until now, those of the earlier run included once it is restored.
     """
 
     writer: ResultWriter
     done: int
     origin: Mapping[str, str]
+    said: list[str]
 
     def check(self) -> None:
         """Raise ResultError if the earlier run had other inputs or settings."""
@@ -175,7 +185,9 @@ class Loop:
 
     def _restore(self, output: Output) -> None:
         with as_damage_error(output.writer.path, "the state of the run"):
-            self.people.resume(output.writer.models, decode(PeopleState, output.writer.state))
+            state = decode(RunState, output.writer.state)
+            self.people.resume(output.writer.models, state.people)
+        output.said[:] = dict.fromkeys([*state.said, *output.said])  # this run has repeated those about its inputs
 
     def _step_through(self, observations: Iterator[Observed]) -> Iterator[tuple[Estimate, ...]]:
         """Step the trackers to the end; estimates are yielded when they are in the file."""
@@ -263,7 +275,7 @@ class Loop:
 
     def _state(self, output: Output) -> Mapping[str, Value]:
         origin = {_ORIGIN + name: value for name, value in output.origin.items()}
-        return {**encode(self.people.state()), **origin}
+        return {**encode(RunState(self.people.state(), output.said)), **origin}
 
 
 def _fill(taken: list[Observed], observations: Iterator[Observed], count: int) -> Iterator[Observed]:

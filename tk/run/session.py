@@ -120,7 +120,8 @@ def track_task(
     causal = task.options.causal
 
     def note(text: str) -> None:
-        said.append(text)
+        if text not in said:  # a resumed run repeats what it says about its inputs
+            said.append(text)
         reporter.note(text)
 
     for text in task.notes:
@@ -133,7 +134,7 @@ def track_task(
         if not (done or second_pass):
             stores.remove()  # of a stopped run; for a second pass, the first frame replaces them
         masks = stores if second_pass else None  # it needs those of all frames
-        loop = Loop(plan, note, Output(writer, done, plan.origin()), masks)
+        loop = Loop(plan, note, Output(writer, done, plan.origin(), said), masks)
         started = time.perf_counter()
         interrupted = False
         try:

@@ -28,7 +28,19 @@ from tk.model.masks.image_health import MOVED, HealthState, ImageHealth, describ
 from tk.model.masks.mask_agreement import Agreement, MaskAgreement
 from tk.model.setup import Setup, Subject
 from tk.model.stateful import Stateful
-from tk.trackers.judgement import FAULTS, STATES, TORN, WRONG, Belief, Cameras, FrameJudge, JudgeState, likelihoods
+from tk.trackers.judgement import (
+    FAULTS,
+    STATES,
+    TORN,
+    UNSEEN,
+    WRONG,
+    Belief,
+    Cameras,
+    FrameJudge,
+    JudgeState,
+    all_left_out,
+    likelihoods,
+)
 from tk.trackers.protocol import Estimate, Frame, Tracker, shows_person, without_cameras
 from tk.trackers.reason import Reason, is_lost
 from tk.trackers.region import RegionTracker
@@ -181,12 +193,12 @@ class CameraMonitor(Stateful[MonitorState]):
             out = np.where(torn, STATES.index(TORN), out)
         else:
             estimate = self.tracker.step(used)
-        out = np.where(out > 0, out, cameras.states)
+        out = all_left_out(np.where(out > 0, out, cameras.states), shows_person(used.masks), estimate)
         estimate = self._frames.judge(frame.index, replace(estimate, cameras=out, shift=self._health.moved))
         self.doubted |= is_lost(estimate.reason) or estimate.found == Reason.CUT
         for camera, state in enumerate(out.tolist()):
             if state:
-                self.doubted[camera] = True
+                self.doubted[camera] |= STATES[state] != UNSEEN
                 _count(self._spans, f"{camera}/{STATES[state]}", frame.index)
         return estimate, used
 

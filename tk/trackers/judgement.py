@@ -13,7 +13,8 @@ A poor mask of a right camera is used, because the others fit as well with it. S
 camera, the person is tracked with the camera and without it (:meth:`Cameras.judge`), and what the others gain decides.
 A torn mask is left out in its frame. A wrong camera is left out until it is right: it is weighed in each frame at the
 pose that the others give. What several frames show is combined by forward probabilities (Rabiner, *Proceedings of the
-IEEE*, 1989).
+IEEE*, 1989). A mask in which the tracker finds nothing of the person is no evidence, and is left out, too
+(:func:`all_left_out`).
 
 **Frames.** What a frame itself shows is its first reason: the numbers that the tracker reports (:class:`Match`), or a
 pose that is impossible after the last one (:class:`FrameJudge`). :func:`judge_frames` adds what several frames show
@@ -62,12 +63,13 @@ class Fault(NamedTuple):
     certain: bool
 
 
-WRONG, TORN = "wrong", "torn"
+WRONG, TORN, UNSEEN = "wrong", "torn", "unseen"
 #: faults of a camera by the names of its states
 FAULTS = {
     WRONG: Fault("disagrees with the others", False),
     TORN: Fault("shows other things, or misses a part of the person", False),
     **{name: Fault(text, True) for name, (text, _) in IMAGE_FAULTS.items()},
+    UNSEEN: Fault("does not see the person", False),
 }
 STATES = ("used", *FAULTS)
 _CERTAIN = np.array([False, *(fault.certain for fault in FAULTS.values())])
@@ -203,6 +205,22 @@ class Cameras(Stateful[Belief]):
     def _marginal(self, likelihood: Float, cameras: Bool) -> float:
         """Return the logarithm of the likelihood of cameras (C,) in unknown states, from those (C, 3) of each state."""
         return float(np.logaddexp.reduce((self._expected() + likelihood)[cameras], axis=1).sum())
+
+
+def all_left_out(states: NDArray[np.uint8], shown: Bool, estimate: Estimate) -> NDArray[np.uint8]:
+    """Return (C,) the states of the cameras in a frame, also of those in which the tracker has found nothing of the
+    person. If it has found nothing in any camera, the frame's reason says so.
+
+    Args:
+        states: (C,) of the cameras, as judged.
+        shown: (C,) whether the masks that the tracker was given show anything. If the tracker has taken all of it for
+            something else, the mask is torn.
+        estimate: of the tracker.
+    """
+    if estimate.residual is None or estimate.found == Reason.NOBODY:
+        return states
+    nothing = np.where(shown, STATES.index(TORN), STATES.index(UNSEEN))
+    return np.where((states == 0) & np.isnan(estimate.residual[:, 0]), nothing, states).astype(np.uint8)
 
 
 def _normalised(nats: Float) -> Float:
