@@ -281,7 +281,7 @@ def test_mask_with_surplus_area_is_left_out_if_the_others_fit_better_without_it(
         return replace(frame, masks=masks)
 
     monitor, estimates, used = scene.follow(too_wide)
-    if camera != 3:  # without camera 3 the others gain hardly anything: its mask is used, and does not mislead
+    if camera == 1:  # the rest gains hardly anything without one of the others: its mask may be used, and misleads none
         assert sum(not u[camera] for u in used[4:]) >= FRAMES / 2 and not used[-1][camera]
     assert all(u[[c for c in range(4) if c != camera]].all() for u in used)
     assert all(f"camera cam{camera + 1}" in line for line in monitor.report())
@@ -313,11 +313,10 @@ def test_two_cameras_that_turn_slowly_are_excluded(scene: Scene) -> None:
         return replace(frame, images=images, masks=masks)
 
     monitor, estimates, used = scene.follow(sagging)
-    # as long as one of three cameras still sags unnoticed, a right one may be blamed in a frame
-    assert sum(not u[[0, 1]].all() for u in used) <= 1 and not any(u[[2, 3]].any() for u in used[8:])
-    assert {line.split(":")[0] for line in monitor.report()} >= {
+    assert all(u[[0, 1]].all() for u in used) and not any(u[[2, 3]].any() for u in used[8:])
+    assert [line.split(":")[0] for line in monitor.report()] == [
         f"camera {name} has been moved since the first frame" for name in ("cam3", "cam4")
-    }
+    ]
     assert monitor.moved.tolist() == [False, False, True, True]
     assert scene.error(estimates, range(FRAMES)) < 0.10
 
