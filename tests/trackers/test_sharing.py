@@ -117,8 +117,10 @@ def test_each_pixel_is_evidence_for_one_of_two_people() -> None:
 def test_pixels_that_no_body_covers_are_evidence_for_everybody_in_reach() -> None:
     """A limb of the one that is in a wrong place, near the other: it is found again only in these pixels."""
     bodies, limb = [block(2, 10, 3.0), block(22, 30, 3.0)], block(10, 20, 3.0)
-    frame = masks_of(*bodies, limb)
-    found = assign(RIG, GRID, bodies, frame, stranger_share=2.0)
+    frame, step = masks_of(*bodies, limb), GRID.step
+    for rows in (slice(19 * step), slice(22 * step, None)):  # a thin one: a large region would be somebody unknown
+        frame.masks[:, rows, 10 * step : 20 * step] = 0
+    found = assign(RIG, GRID, bodies, frame)
     one, other = (GRID.sample(found.share(frame, person).masks)[:, 20] for person in (0, 1))
     cell_m = 3.0 * GRID.step / RIG[0].matrix[0, 0]
     middle, ends = slice(15, 17), round(NEAR_M / cell_m)
