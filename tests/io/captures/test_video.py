@@ -488,6 +488,29 @@ def test_threads_end_when_the_reader_is_deleted() -> None:
     assert all(clip.closed == 1 for clip in clips)
 
 
+def test_deleting_a_reader_does_not_wait_for_an_image() -> None:
+    """The garbage collector may delete it in a thread that the decoding threads wait for."""
+    begun, go_on = threading.Event(), threading.Event()
+
+    class Slow(FakeClip):
+        def read(self, out: Any) -> None:
+            begun.set()
+            assert go_on.wait(30)
+            super().read(out)
+
+    clip = Slow(0)
+    reader = reader_of([clip])
+    assert begun.wait(30)
+    del reader
+    gc.collect()
+    assert clip.closed == 0
+    go_on.set()
+    for thread in threading.enumerate():
+        if thread.name.startswith("tk-decode-"):
+            thread.join(30)
+    assert clip.closed == 1
+
+
 def test_a_reader_can_be_closed_twice_and_while_skipping() -> None:
     clips = [FakeClip(0, frame_count=10**9)]
     reader = reader_of(clips, start=10**9 - 1, stop=10**9)

@@ -22,8 +22,6 @@ from tk.model.masks.background import reduced
 _AHEAD = 8
 _AHEAD_BYTES = 128_000_000
 
-_THREAD = "tk-decode-"  # names of the threads begin with it
-
 
 @dataclass(frozen=True)
 class FrameSet:
@@ -81,9 +79,9 @@ class FrameReader(Iterator[FrameSet]):
             frames = np.asarray(wanted) - (late[camera] if late else 0)
             self._cameras.append([Images(each, frames, stop) for each in own])
         # a thread knows its films, not this reader: dropping the reader ends the threads
-        self._threads = [ThreadPoolExecutor(1, f"{_THREAD}{camera}") for camera in range(count)]
+        self._threads = [ThreadPoolExecutor(1, f"tk-decode-{camera}") for camera in range(count)]
         films = [film for camera in self._cameras for film in camera]
-        self._finalizer = weakref.finalize(self, _shut, stop, self._threads, films)
+        self._finalizer = weakref.finalize(self, _end, stop, self._threads, films)
         self._coming: deque[tuple[FrameSet, list[Future[None]]]] = deque()
         for _ in range(ahead):
             self._schedule()
@@ -136,6 +134,8 @@ class FrameReader(Iterator[FrameSet]):
         self._coming.clear()
         self._scheduled = len(self._wanted)
         self._finalizer()
+        for thread in self._threads:
+            thread.shutdown()
 
 
 class _Stacks:
@@ -174,12 +174,19 @@ class Images:
     def __init__(self, clip: Clip, frames: NDArray[np.int64], stop: threading.Event | None = None) -> None:
         self._clip, self._numbers, self._stop = clip, clip.shown(frames).tolist(), stop or threading.Event()
         self._reader: Reader | None = None
+        self._busy = threading.Lock()
         self._following = 0  # number of the next image in the clip
         self._kept: Image | None = None  # an image that several frames show
 
     def read(self, place: int, stack: Image) -> None:
         """Write the image of ``frames[place]`` into the upper left of (H, W, 3), or (H, W) for a mask; black if the
         frame is blank."""
+        with self._busy:
+            self._read(place, stack)
+        if self._stop.is_set():
+            self.close()
+
+    def _read(self, place: int, stack: Image) -> None:
         out, number = stack[: self._clip.height, : self._clip.width], self._numbers[place]
         if number < 0:
             out[...] = 0
@@ -200,8 +207,12 @@ class Images:
             self._kept = out.copy() if again else None
 
     def close(self) -> None:
-        if self._reader is not None:
-            self._reader.close()
+        """Close the clip, without waiting: if an image is being read, it is closed after that."""
+        if self._busy.acquire(blocking=False):
+            if self._reader is not None:
+                self._reader.close()
+            self._reader = None
+            self._busy.release()
 
 
 def _decode(films: Sequence[Images], place: int, layers: Sequence[Image]) -> None:
@@ -210,11 +221,11 @@ def _decode(films: Sequence[Images], place: int, layers: Sequence[Image]) -> Non
         film.read(place, layer)
 
 
-def _shut(stop: threading.Event, threads: Sequence[ThreadPoolExecutor], films: Sequence[Images]) -> None:
+def _end(stop: threading.Event, threads: Sequence[ThreadPoolExecutor], films: Sequence[Images]) -> None:
+    """Let decoding end, without waiting: the garbage collector may call this anywhere, also in a thread that is just
+    starting and holds a lock without which no thread ends."""
     stop.set()
-    # the garbage collector may call this from a decoding thread, which cannot wait for itself
-    wait = not threading.current_thread().name.startswith(_THREAD)
     for thread in threads:
-        thread.shutdown(wait, cancel_futures=True)
-    for film in films if wait else ():
+        thread.shutdown(wait=False, cancel_futures=True)
+    for film in films:
         film.close()
