@@ -62,7 +62,8 @@ ROUNDS, WINDOW, OVERLAP = 2, 1000, 30
 LEVEL = 1
 # Clothes, shadows and the shapes of the model err alike as long as the pose is the same. So the likelihood of a frame
 # counts by the share of CORRELATED_M, metres, that the fastest joint moves in it, and at least by its share of STILL_S,
-# seconds: a person who stands still is seen once, not once a frame.
+# seconds: a person who stands still is seen once, not once a frame. CORRELATED_M was chosen on rendered people
+# (docs/experiments.md, Sigma); STILL_S is assumed.
 CORRELATED_M, STILL_S = 0.2, 1.0
 # The negative logarithm of a step's probability is its length divided by STEP_M. In frames with pixels of other people
 # another pose costs SHARED nats more, because the masks do not show the colours by which the first pass has chosen.

@@ -19,12 +19,13 @@ from tk.model.body.skeleton import JOINTS, SEGMENTS, Skeleton
 Float = NDArray[np.float64]
 
 # Offset of a joint from the anatomical one, metres along an axis, and the error of all joints when the waist bends by
-# one radian. Fitted on walk, dance, fold, cube and treadmill-slow, so that as many errors lie within 1 and 2 σ as for a
-# normal distribution. The joints' constant offsets on these captures are about as large as the first.
+# one radian, metres; fitted to rendered people, so that as many errors lie within 1 and 2 σ as for a normal
+# distribution.
 OFFSET_M, BENT_M = 0.0067, 0.0145
 
 # Standard deviation of the displacement of a segment's contours in one view by clothes and the model's shape, metres
-# along an axis: of the part that is the same in all frames of a recording, and of the part that changes.
+# along an axis: of the part that is the same in all frames of a recording, and of the part that changes, chosen on
+# rendered people (docs/experiments.md, Sigma).
 CONSTANT_M, CHANGING_M = 0.015, 0.003
 
 # The bone that each joint turns with, by the joints at its ends; the trunk's own joints have none.
