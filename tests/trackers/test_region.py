@@ -509,13 +509,15 @@ def test_second_pass_finds_legs_that_were_exchanged_in_most_frames() -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_probability_of_two_states_is_that_of_all_paths(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    cost, steps = rng.normal(scale=2.0, size=6), rng.exponential(size=(2, 2, 5))
+    cost, steps = rng.normal(scale=2.0, size=6), rng.exponential(size=(6, 2, 2, 2))
+    steps[:2] = steps[:2, :1]  # nothing is before the first frame
     paths = np.array(list(itertools.product((0, 1), repeat=6)))
-    logs = -(paths * cost).sum(axis=1) - steps[paths[:, :-1], paths[:, 1:], np.arange(5)].sum(axis=1)
+    logs = -(paths * cost).sum(axis=1) - steps[1, 0, paths[:, 0], paths[:, 1]]
+    logs -= steps[np.arange(2, 6), paths[:, :-2], paths[:, 1:-1], paths[:, 2:]].sum(axis=1)
     weight = np.exp(logs) / np.exp(logs).sum()
     np.testing.assert_allclose(second_of_two(cost, steps), weight @ paths, rtol=1e-9)
     # a cost of thousands is no overflow
-    found = second_of_two(np.array([1e4, -1e4]), np.zeros((2, 2, 1)))
+    found = second_of_two(np.array([1e4, -1e4]), np.zeros((2, 2, 2, 2)))
     np.testing.assert_allclose(found, [0.0, 1.0], atol=1e-100)
 
 

@@ -7,10 +7,11 @@ This matters with the same body and cameras, too: without it, the limbs' mean er
 larger, with two cameras 0.1 cm, and more limbs stay more than 10 cm off.
 
 The first pass may have misplaced an arm, exchanged the legs, or taken the back for the front, for a while. So other
-poses of the body and of its arms are tracked through the whole recording, forwards and backwards. They begin at the
-pose in the neighbouring frame, or at the exchanged legs. A hidden Markov model with two states, the present and the
-other pose, gives the probability of either in each frame, from the costs in all frames and the lengths of the joints'
-steps (Rabiner, Proc. IEEE, 1989). The pose becomes the likelier one, and σ includes the difference. Other poses that
+poses of the body and of its arms are tracked through the whole recording, forwards and backwards, from frame to frame
+as in the first pass: from the prediction, at a coarse scale first. They begin at the prediction from the neighbouring
+frames, or at the exchanged legs. A hidden Markov model with two states, the present and the
+other pose, gives the probability of either in each frame, from the costs in all frames and the changes of the joints'
+velocities (Rabiner, Proc. IEEE, 1989). The pose becomes the likelier one, and σ includes the difference. Other poses that
 the first pass found in its limb searches are tracked in the same manner, from the frames of the searches on, and only
 add to σ: the first pass has compared them with colours.
 
@@ -58,16 +59,17 @@ AT_ONCE = 16
 # Iterations over all frames together; frames of which the equations are in memory at once, and frames before and after
 # them that are solved with them: what a frame shows about others fades within some frames.
 ROUNDS, WINDOW, OVERLAP = 2, 1000, 30
-# Scale at which other poses are optimised.
+# Scale at which other poses are compared; they are optimised at the next coarser one first.
 LEVEL = 1
 # Clothes, shadows and the shapes of the model err alike as long as the pose is the same. So the likelihood of a frame
 # counts by the share of CORRELATED_M, metres, that the fastest joint moves in it, and at least by its share of STILL_S,
 # seconds: a person who stands still is seen once, not once a frame. CORRELATED_M was chosen on rendered people
 # (docs/experiments.md, Sigma); STILL_S is assumed.
 CORRELATED_M, STILL_S = 0.2, 1.0
-# The negative logarithm of a step's probability is its length divided by STEP_M. In frames with pixels of other people
-# another pose costs SHARED nats more, because the masks do not show the colours by which the first pass has chosen.
-STEP_M, SHARED = SAME_POSE_M, 1.0
+# People keep their velocity: the negative logarithm of a step's probability is the change from the step before, of the
+# joint that changes most, divided by CHANGE_M. In frames with pixels of other people another pose costs SHARED nats
+# more, because the masks do not show the colours by which the first pass has chosen.
+CHANGE_M, SHARED = SAME_POSE_M, 1.0
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ class Alternative:
         limb: if they are a limb's, only this limb moves.
         legs: the legs, if it begins with exchanged legs.
         mode: its row, if it begins at the modes of the first pass; it never becomes the pose. Without legs or mode it
-            begins at the pose in the neighbouring frame.
+            begins at the prediction from the neighbouring frames.
     """
 
     dofs: NDArray[np.int64]
@@ -120,6 +122,7 @@ class SecondPass:
         self.tracker, self._masks, self._report = tracker, masks, report
         self._measured, self._modes = measured, modes
         self.tracked = np.flatnonzero(~lost)
+        self._seen = frozenset(self.tracked.tolist())
         self._share = np.ones(len(poses))
         steps, seen = _steps(tracker.body.skeleton.joints(poses[self.tracked])), len(self.tracked)
         self._share[self.tracked] = np.clip(steps / CORRELATED_M, 1.0 / min(tracker.fps * STILL_S, seen), 1.0)
@@ -246,9 +249,7 @@ class SecondPass:
         skeleton, frames, other = self.tracker.body.skeleton, self.tracked, self.poses.copy()
         other[:, one.dofs] = poses[:, one.dofs]
         joints = skeleton.joints(np.array([self.poses[frames], other[frames]]))
-        steps = np.linalg.norm(joints[:, None, :-1] - joints[None, :, 1:], axis=-1).max(axis=-1)
-        steps[:, :, np.diff(frames) > 1] = 0.0  # anything may happen in lost frames
-        share = second_of_two(cost[frames], steps / STEP_M)
+        share = second_of_two(cost[frames], _changes(joints, frames) / CHANGE_M)
         apart = ((joints[1] - joints[0]) ** 2).sum(axis=-1) / 3
         self._variance[1, frames] += (share * (1.0 - share))[:, None] * apart
         return other, frames[share > 0.5]
@@ -274,7 +275,7 @@ class SecondPass:
         cost, mean = np.zeros(result.shape[:2]), np.full(len(alternatives), np.nan)  # NaN: none is tracked
         for begin in range(0, len(order) - 1, AT_ONCE):
             frames = order[begin + 1 : begin + 1 + AT_ONCE]
-            lasts, seen = order[begin : begin + len(frames)], cache(lambda i: self._pyramid(i, LEVEL + 1))
+            lasts, seen = order[begin : begin + len(frames)], cache(lambda i: self._pyramid(i, LEVEL + 2))
             # most alternatives become the present pose at once: those that begin are settled together
             starts = np.stack([self._starts(one, lasts, frames, step) for one in alternatives])
             begun = self._settled(alternatives, starts, frames, seen)
@@ -287,8 +288,8 @@ class SecondPass:
                 if tracked := np.flatnonzero(np.isfinite(known)).tolist():
                     going_on = [alternatives[k] for k in tracked]
                     starts = np.repeat(present[None, None], len(tracked), axis=0)
-                    for start, near, one in zip(starts[:, 0], result[tracked, last], going_on, strict=True):
-                        start[one.dofs] = near[one.dofs]
+                    for start, known_to, one in zip(starts[:, 0], result[tracked], going_on, strict=True):
+                        start[one.dofs] = self._predicted(known_to, last, step)[one.dofs]
                     poses[tracked] = self._settled(going_on, starts, frames[n : n + 1], seen)[:, 0]
                 differ = np.flatnonzero((poses != present).any(axis=1))
                 if not len(differ):
@@ -314,11 +315,19 @@ class SecondPass:
             known = np.flatnonzero(np.isfinite(angles).all(axis=1))
             poses[np.ix_(known, one.dofs)] = angles[known]
         elif not one.legs:
-            poses[np.ix_(follows, one.dofs)] = self.poses[np.ix_(lasts[follows], one.dofs)]
+            for n in np.flatnonzero(follows).tolist():
+                poses[n, one.dofs] = self._predicted(self.poses, lasts[n], step)[one.dofs]
         elif every:
             for n in np.flatnonzero(follows & (frames % every == 0)).tolist():
                 poses[n] = exchanged(poses[n], [one.legs])[0]
         return poses
+
+    def _predicted(self, poses: Float, last: int, step: int) -> Float:
+        """Return the pose (D,) that poses (F, D) until frame ``last`` predict for the next one."""
+        before = last - step
+        moves = 0 <= before < len(poses) and before in self._seen
+        velocity = poses[last] - poses[before] if moves else 0.0
+        return np.asarray(poses[last] + self.tracker.contours.prediction * velocity)
 
     def _settled(
         self,
@@ -334,9 +343,12 @@ class SecondPass:
         far = skeleton.apart(starts, joints) > SAME_POSE_M
         for one, poses, start, differ in zip(alternatives, result, starts, far, strict=True):
             if differ.any():
-                pyramid = Pyramid.of_all([seen(i) for i in frames[differ].tolist()], LEVEL)
-                prior = tracker.prior(start[differ], ANGLE_DEG)
-                poses[differ] = tracker.settle(pyramid, start[differ], (LEVEL,), prior=prior, limb=one.limb).states
+                prior = tracker.prior(start[differ])
+                found = start[differ]
+                for level in (LEVEL + 1, LEVEL):
+                    pyramid = Pyramid.of_all([seen(i) for i in frames[differ].tolist()], level)
+                    found = tracker.settle(pyramid, found, (level,), prior=prior, limb=one.limb).states
+                poses[differ] = found
         if far.any():
             result = np.where(skeleton.apart(result, joints)[..., None] > SAME_POSE_M, result, present)
         return result
@@ -360,20 +372,45 @@ class SecondPass:
         return self.tracker.views.pyramid(shown, scales, False, in_frames(self._measured, i, used))
 
 
+def _changes(joints: Float, frames: NDArray[np.int64]) -> Float:
+    """Return (F, 2, 2, 2) how far a joint is from where constant velocity would take it, metres, the joint for which
+    this is most: of the steps from each of two states, two frames before, by each state of the frame before.
+
+    Args:
+        joints: (2, F, J, 3) in the two states.
+        frames: (F,) their numbers. Anything may happen in lost frames; after them the velocity is not known.
+    """
+    result = np.zeros((joints.shape[1], 2, 2, 2))
+    steps = joints[None, :, 1:] - joints[:, None, :-1]
+    result[1:] = np.linalg.norm(steps, axis=-1).max(axis=-1).transpose(2, 0, 1)[:, None]
+    changes = steps[None, :, :, 1:] - steps[:, :, None, :-1]
+    follows = np.diff(frames) == 1
+    known = np.flatnonzero(follows[1:] & follows[:-1])
+    result[2 + known] = np.linalg.norm(changes[..., known, :, :], axis=-1).max(axis=-1).transpose(3, 0, 1, 2)
+    result[1:][~follows] = 0.0
+    return result
+
+
 def second_of_two(cost: Float, steps: Float) -> Float:
-    """Return (F,) the probability of the second of two states in each of F frames, by the forward-backward algorithm.
+    """Return (F,) the probability of the second of two states in each of F frames, by the forward-backward algorithm
+    for pairs of states.
 
     Args:
         cost: (F,) negative logarithm of the second state's likelihood relative to the first's.
-        steps: (2, 2, F - 1) negative logarithm of the probability of each step from a state to a state.
+        steps: (F, 2, 2, 2) negative logarithm of the probability of a frame's state, last axis, after those two frames
+            and one frame before it.
     """
     frame = np.stack([np.zeros_like(cost), cost], axis=1)
-    forward, backward = frame.copy(), np.zeros_like(frame)
+    forward = np.zeros((len(cost), 2, 2))  # of the states of the frame before, and of the frame
+    backward = np.zeros_like(forward)
+    forward[0] = frame[0]
     for k in range(1, len(cost)):
-        forward[k] -= np.logaddexp(*(-forward[k - 1, :, None] - steps[:, :, k - 1]))
+        before = forward[k - 1, :, :, None] + steps[k]
+        forward[k] = frame[k] - np.logaddexp(-before[0], -before[1])
     for k in range(len(cost) - 1, 0, -1):
-        backward[k - 1] = -np.logaddexp(*(-steps[:, :, k - 1] - (frame + backward)[k]).T)
-    first, second = (forward + backward).T
+        after = steps[k] + frame[k] + backward[k]
+        backward[k - 1] = -np.logaddexp(-after[..., 0], -after[..., 1])
+    first, second = -np.logaddexp.reduce(-(forward + backward), axis=1).T
     return np.asarray(1.0 / (1.0 + np.exp(np.clip(second - first, -500.0, 500.0))))
 
 
