@@ -441,20 +441,20 @@ def test_second_pass_corrects_the_frames_before_a_limb_was_found() -> None:
 
 def test_sigma_is_large_if_two_poses_have_similar_costs() -> None:
     """The masks show an arm at both of its places; frames before and after tell of one each."""
-    hanging = np.repeat(POSES[:1], 3, axis=0)
+    hanging = np.repeat(POSES[:1], 5, axis=0)
     raised = np.array([with_arm(pose, "l", (0.1, 1.0, 0.3), 15.0) for pose in hanging])
     half = draw_silhouettes(BODY, RIG, np.array([hanging[0], raised[0]])).max(axis=0)
     tracker, wrist = tracker_at(POSES[0]), JOINTS.index("wrist_l")
 
     def sigma(masks: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        return tracker.second_pass(masks, poses, np.zeros(3, bool), np.zeros((3, 3, 2)), None, keep_body=True)[2][
+        return tracker.second_pass(masks, poses, np.zeros(5, bool), np.zeros((5, 3, 2)), None, keep_body=True)[2][
             :, wrist
         ]
 
     one, other = draw_silhouettes(BODY, RIG, np.array([hanging[0], raised[0]]))
-    found = sigma(np.array([one, half, other]), np.concatenate([hanging[:2], raised[2:]]))
-    assert (found > 0.1).tolist() == [False, True, False]
-    assert (sigma(np.array([half, half, half]), hanging) < 0.05).all()
+    found = sigma(np.array([one, one, half, other, other]), np.concatenate([hanging[:3], raised[3:]]))
+    assert (found > 0.1).tolist() == [False, False, True, False, False]
+    assert (sigma(np.stack(5 * [half]), hanging) < 0.05).all()
 
 
 def test_modes_of_the_first_pass_add_to_sigma_and_change_no_pose() -> None:

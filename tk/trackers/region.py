@@ -226,7 +226,9 @@ class RegionTracker(ContourTracker[RegionState]):
         watch.lap("masks_clean")
         # predict, settle
         self._alive += [replace(h, previous=h.pose, jumped=False) for h in self._alive if h.jumped]
-        starts = np.array([h.pose + contours.prediction * (h.pose - h.previous) for h in self._alive])
+        # angles that only landmarks show change when these are seen, not by motion
+        velocity = np.where(self.body.skeleton.is_by_landmarks, 0.0, contours.prediction)
+        starts = np.array([h.pose + velocity * (h.pose - h.previous) for h in self._alive])
         prior = self.prior(starts)
         poses, _, iterations = self.settle(pyramid, starts, self._scales(), seen.images, prior)
         watch.lap("optimise")

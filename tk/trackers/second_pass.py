@@ -7,13 +7,12 @@ This matters with the same body and cameras, too: without it, the limbs' mean er
 larger, with two cameras 0.1 cm, and more limbs stay more than 10 cm off.
 
 The first pass may have misplaced an arm, exchanged the legs, or taken the back for the front, for a while. So other
-poses of the body and of its arms are tracked through the whole recording, forwards and backwards, from frame to frame
-as in the first pass: from the prediction, at a coarse scale first. They begin at the prediction from the neighbouring
-frames, or at the exchanged legs. A hidden Markov model with two states, the present and the
-other pose, gives the probability of either in each frame, from the costs in all frames and the changes of the joints'
-velocities (Rabiner, Proc. IEEE, 1989). The pose becomes the likelier one, and σ includes the difference. Other poses that
-the first pass found in its limb searches are tracked in the same manner, from the frames of the searches on, and only
-add to σ: the first pass has compared them with colours.
+poses of the body and of its arms are tracked through the whole recording, forwards and backwards. They begin at the
+prediction from the neighbouring frames, or at the exchanged legs. A hidden Markov model with two states, the present
+and the other pose, gives the probability of either in each frame, from the costs in all frames and the changes of the
+joints' velocities (Rabiner, Proc. IEEE, 1989). The pose becomes the likelier one, and σ includes the difference. Other
+poses that the first pass found in its limb searches are tracked in the same manner, from the frames of the searches on,
+and only add to σ: the first pass has compared them with colours.
 
 Then one problem of all frames, coupled by the motion, gives the poses and their covariances
 (:mod:`tk.optim.trajectory`).
@@ -59,17 +58,18 @@ AT_ONCE = 16
 # Iterations over all frames together; frames of which the equations are in memory at once, and frames before and after
 # them that are solved with them: what a frame shows about others fades within some frames.
 ROUNDS, WINDOW, OVERLAP = 2, 1000, 30
-# Scale at which other poses are compared; they are optimised at the next coarser one first.
+# Scale at which other poses are optimised.
 LEVEL = 1
 # Clothes, shadows and the shapes of the model err alike as long as the pose is the same. So the likelihood of a frame
 # counts by the share of CORRELATED_M, metres, that the fastest joint moves in it, and at least by its share of STILL_S,
 # seconds: a person who stands still is seen once, not once a frame. CORRELATED_M was chosen on rendered people
 # (docs/experiments.md, Sigma); STILL_S is assumed.
 CORRELATED_M, STILL_S = 0.2, 1.0
-# People keep their velocity: the negative logarithm of a step's probability is the change from the step before, of the
-# joint that changes most, divided by CHANGE_M. In frames with pixels of other people another pose costs SHARED nats
+# People keep their velocity: VELOCITY times a step predicts the next one best (docs/experiments.md, Second pass), and
+# the negative logarithm of a step's probability is the distance to this prediction, of the joint that is farthest
+# from it, divided by CHANGE_M. In frames with pixels of other people another pose costs SHARED nats
 # more, because the masks do not show the colours by which the first pass has chosen.
-CHANGE_M, SHARED = SAME_POSE_M, 1.0
+VELOCITY, CHANGE_M, SHARED = 0.8, SAME_POSE_M, 1.0
 
 
 @dataclass(frozen=True)
@@ -88,6 +88,11 @@ class Alternative:
     limb: Limb | None = None
     legs: tuple[Limb, ...] = ()
     mode: int | None = None
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether it begins where the present pose would go, so that both have the same past."""
+        return not self.legs and self.mode is None
 
 
 class SecondPass:
@@ -249,7 +254,7 @@ class SecondPass:
         skeleton, frames, other = self.tracker.body.skeleton, self.tracked, self.poses.copy()
         other[:, one.dofs] = poses[:, one.dofs]
         joints = skeleton.joints(np.array([self.poses[frames], other[frames]]))
-        share = second_of_two(cost[frames], _changes(joints, frames) / CHANGE_M)
+        share = second_of_two(cost[frames], _surprises(joints, frames) / CHANGE_M)
         apart = ((joints[1] - joints[0]) ** 2).sum(axis=-1) / 3
         self._variance[1, frames] += (share * (1.0 - share))[:, None] * apart
         return other, frames[share > 0.5]
@@ -273,9 +278,10 @@ class SecondPass:
         """
         order, result = self.tracked[::step], np.repeat(self.poses[None], len(alternatives), axis=0)
         cost, mean = np.zeros(result.shape[:2]), np.full(len(alternatives), np.nan)  # NaN: none is tracked
+        moves = np.array([one.goes_on for one in alternatives])  # whether its last step was motion, and no jump
         for begin in range(0, len(order) - 1, AT_ONCE):
             frames = order[begin + 1 : begin + 1 + AT_ONCE]
-            lasts, seen = order[begin : begin + len(frames)], cache(lambda i: self._pyramid(i, LEVEL + 2))
+            lasts, seen = order[begin : begin + len(frames)], cache(lambda i: self._pyramid(i, LEVEL + 1))
             # most alternatives become the present pose at once: those that begin are settled together
             starts = np.stack([self._starts(one, lasts, frames, step) for one in alternatives])
             begun = self._settled(alternatives, starts, frames, seen)
@@ -285,12 +291,14 @@ class SecondPass:
                 if i != last + step:
                     continue
                 present, poses = self.poses[i], begun[:, n]
-                if tracked := np.flatnonzero(np.isfinite(known)).tolist():
-                    going_on = [alternatives[k] for k in tracked]
-                    starts = np.repeat(present[None, None], len(tracked), axis=0)
-                    for start, known_to, one in zip(starts[:, 0], result[tracked], going_on, strict=True):
-                        start[one.dofs] = self._predicted(known_to, last, step)[one.dofs]
-                    poses[tracked] = self._settled(going_on, starts, frames[n : n + 1], seen)[:, 0]
+                if (tracked := np.flatnonzero(np.isfinite(known))).size:
+                    some = [alternatives[k] for k in tracked]
+                    starts = np.repeat(present[None, None], len(some), axis=0)
+                    for start, k, one in zip(starts[:, 0], tracked, some, strict=True):
+                        predicted = self._predicted(result[k], last, step) if moves[k] else result[k, last]
+                        start[one.dofs] = predicted[one.dofs]
+                    poses[tracked] = self._settled(some, starts, frames[n : n + 1], seen)[:, 0]
+                moves = np.array([one.goes_on for one in alternatives]) | np.isfinite(known)
                 differ = np.flatnonzero((poses != present).any(axis=1))
                 if not len(differ):
                     continue
@@ -314,7 +322,7 @@ class SecondPass:
             angles = self._modes[frames, one.mode][:, one.dofs]
             known = np.flatnonzero(np.isfinite(angles).all(axis=1))
             poses[np.ix_(known, one.dofs)] = angles[known]
-        elif not one.legs:
+        elif one.goes_on:
             for n in np.flatnonzero(follows).tolist():
                 poses[n, one.dofs] = self._predicted(self.poses, lasts[n], step)[one.dofs]
         elif every:
@@ -327,7 +335,7 @@ class SecondPass:
         before = last - step
         moves = 0 <= before < len(poses) and before in self._seen
         velocity = poses[last] - poses[before] if moves else 0.0
-        return np.asarray(poses[last] + self.tracker.contours.prediction * velocity)
+        return np.asarray(poses[last] + VELOCITY * velocity)
 
     def _settled(
         self,
@@ -343,12 +351,9 @@ class SecondPass:
         far = skeleton.apart(starts, joints) > SAME_POSE_M
         for one, poses, start, differ in zip(alternatives, result, starts, far, strict=True):
             if differ.any():
-                prior = tracker.prior(start[differ])
-                found = start[differ]
-                for level in (LEVEL + 1, LEVEL):
-                    pyramid = Pyramid.of_all([seen(i) for i in frames[differ].tolist()], level)
-                    found = tracker.settle(pyramid, found, (level,), prior=prior, limb=one.limb).states
-                poses[differ] = found
+                pyramid = Pyramid.of_all([seen(i) for i in frames[differ].tolist()], LEVEL)
+                prior = tracker.prior(start[differ], ANGLE_DEG)
+                poses[differ] = tracker.settle(pyramid, start[differ], (LEVEL,), prior=prior, limb=one.limb).states
         if far.any():
             result = np.where(skeleton.apart(result, joints)[..., None] > SAME_POSE_M, result, present)
         return result
@@ -372,9 +377,9 @@ class SecondPass:
         return self.tracker.views.pyramid(shown, scales, False, in_frames(self._measured, i, used))
 
 
-def _changes(joints: Float, frames: NDArray[np.int64]) -> Float:
-    """Return (F, 2, 2, 2) how far a joint is from where constant velocity would take it, metres, the joint for which
-    this is most: of the steps from each of two states, two frames before, by each state of the frame before.
+def _surprises(joints: Float, frames: NDArray[np.int64]) -> Float:
+    """Return (F, 2, 2, 2) how far a joint is from its prediction, metres, the joint for which this is most: in each of
+    two states, last axis, predicted from each state of two frames before and of the frame before.
 
     Args:
         joints: (2, F, J, 3) in the two states.
@@ -383,10 +388,10 @@ def _changes(joints: Float, frames: NDArray[np.int64]) -> Float:
     result = np.zeros((joints.shape[1], 2, 2, 2))
     steps = joints[None, :, 1:] - joints[:, None, :-1]
     result[1:] = np.linalg.norm(steps, axis=-1).max(axis=-1).transpose(2, 0, 1)[:, None]
-    changes = steps[None, :, :, 1:] - steps[:, :, None, :-1]
+    away = steps[None, :, :, 1:] - VELOCITY * steps[:, :, None, :-1]
     follows = np.diff(frames) == 1
     known = np.flatnonzero(follows[1:] & follows[:-1])
-    result[2 + known] = np.linalg.norm(changes[..., known, :, :], axis=-1).max(axis=-1).transpose(3, 0, 1, 2)
+    result[2 + known] = np.linalg.norm(away[..., known, :, :], axis=-1).max(axis=-1).transpose(3, 0, 1, 2)
     result[1:][~follows] = 0.0
     return result
 
