@@ -81,7 +81,7 @@ class SilhouetteSettings:
         lost_error: a frame is lost if its E_S, averaged over the views, exceeds this.
     """
 
-    prediction: float = 0.8
+    prediction: float = 0.5
     adapt: bool = True
     init_frames: int = 24
     search_every: float = 0.7
