@@ -319,7 +319,7 @@ class RegionTracker(ContourTracker[RegionState]):
             )
             # a quarter of the pixels shows objects that are wider than six pixels; narrower ones are ignored
             coarse = crop(frame.images[c], masks.shape[1:], *box, step=2)
-            odd_pixels = foreign[color_bins(coarse)] & (masks[c][box][::2, ::2] >= PERSON)
+            odd_pixels = foreign.take(color_bins(coarse)) & (masks[c][box][::2, ::2] >= PERSON)
             opened = np.asarray(cv2.morphologyEx(odd_pixels.view(np.uint8), cv2.MORPH_OPEN, SQUARE3), np.uint8)
             if not opened.any():
                 continue
