@@ -16,6 +16,7 @@ from tests.people import truth, write_people
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.captures.frames import FrameSet
 from tk.model.cameras.camera import Rig
+from tk.model.masks.foreground import CollinearityForeground
 from tk.run.learned_masks import LEARNED, LEARNED_AND_SEGMENTER, SEGMENTER
 from tk.run.segmentation import Labels, make_labeller
 from tk.run.task import Task
@@ -89,6 +90,15 @@ def test_masks_do_not_depend_on_the_first_frame(folder: Path) -> None:
     for a, b in zip(whole[37:], part, strict=True):
         for one, other in zip(a, b, strict=True):
             np.testing.assert_array_equal(one, other)
+
+
+def test_first_frame_waits_for_no_check_of_later_samples(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture, label = capture_of(folder)[0], CollinearityForeground.label
+    counts = []
+    monkeypatch.setattr(CollinearityForeground, "label", lambda *a, **k: counts.append(1) or label(*a, **k))
+    with capture.frames() as frames:
+        make_labeller(Task.of(capture, Settings()), lambda _: None)(next(frames))
+    assert len(counts) == 2  # its own masks, and the check of the sample that it is
 
 
 def test_still_trunk_stays_in_the_masks(tmp_path: Path) -> None:

@@ -21,17 +21,18 @@ from tests.trackers.walker import BODY, STATURE, walk
 from tk.errors import CaptureError, ConfigError
 from tk.io import settings_file
 from tk.io.captures.frames import FrameSet
+from tk.io.results.codec import encode
 from tk.io.results.data import Result
 from tk.io.results.reader import read_result
 from tk.io.results.status import Status
 from tk.model.body.angles import UNSEEN
 from tk.model.cameras.volume import Volume
 from tk.model.setup import Setup, Subject
-from tk.run import offline
+from tk.run import loop, offline
 from tk.run.draft import Draft
 from tk.run.session import estimates, track_task
 from tk.run.task import Choice, Task, TrackOptions
-from tk.trackers.protocol import Frame
+from tk.trackers.protocol import Estimate, Frame
 from tk.trackers.region import RegionTracker
 
 SETTINGS = settings_file.from_toml(QUICK.replace("init_frames = 3", "init_frames = 1"))
@@ -166,6 +167,29 @@ def test_a_run_that_began_with_an_empty_volume_is_resumed(
     assert (result.status[:EMPTY] == Status.ABSENT).all()
     for name in ("pose", "status", "sigma"):
         np.testing.assert_array_equal(getattr(result, name)[EMPTY:], getattr(begun, name))
+
+
+def test_a_run_that_fails_in_a_step_between_two_writes_is_resumed(
+    begun: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step, made, path = RegionTracker.step, [], tmp_path / "r.h5"
+
+    def fail(tracker: RegionTracker, frame: Frame) -> Estimate:
+        estimate = step(tracker, frame)
+        if frame.index == EMPTY + 3:
+            raise CaptureError("broken")
+        return estimate
+
+    run_clock(monkeypatch, 1e-9)  # only the first frame is written by itself
+    any_pose = replace(SETUP, subjects=(replace(SETUP.subjects[0], in_init_pose=False),))
+    monkeypatch.setattr(loop, "encode", lambda state: made.append(state) or encode(state))
+    with monkeypatch.context() as patched, refused(CaptureError, "broken"):
+        patched.setattr(RegionTracker, "step", fail)
+        track_task(task(any_pose, LATE, frames=(EMPTY, None)), path, Silent())
+    assert len(read_result(path)) == 3 and len(made) == 1  # states are made when they are written
+    track_task(task(any_pose, LATE, frames=(EMPTY, None)), path, Silent(), resume=True)
+    for name in ("frames", "pose", "status", "sigma"):
+        np.testing.assert_array_equal(getattr(read_result(path), name), getattr(begun, name))
 
 
 def test_nobody_in_any_frame_is_an_error_that_leaves_no_file(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -83,6 +84,26 @@ def test_masks_show_everybody(places: list[At]) -> None:
     for k in range(len(places)):
         assert (masks > 0)[who == k + 1].mean() > 0.9, k
     assert (masks > 0)[who == 0].mean() < 0.002
+
+
+@dataclass
+class Parallel(OneOfMany):
+    """May be called at once, and notes by which threads."""
+
+    parallel = True
+    threads: set[int] = field(default_factory=set)
+
+    def segment(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        self.threads.add(threading.get_ident())
+        return super().segment(image)
+
+
+def test_cameras_are_segmented_at_once_with_the_same_masks() -> None:
+    images, _ = shown([(0.0, 0.0), (0.5, 0.1)])
+    at_once = Parallel()
+    for a, b in zip(masks_of(OneOfMany()).label(images), masks_of(at_once).label(images), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert at_once.threads - {threading.get_ident()}
 
 
 def test_person_whom_a_camera_does_not_detect_is_in_its_mask() -> None:

@@ -69,7 +69,6 @@ def track(
     with reporter, started_early():
         from tk.io.importers import open_recording
         from tk.io.results.files import check_result_path
-        from tk.report.after import film_for
         from tk.run import session
 
         options = base.recording_options(causal=causal, **given)
@@ -79,7 +78,11 @@ def track(
         reporter.stage(f"opening {capture}")
         opened = open_recording(capture, options.cameras, options.masks, options.settings.resample)
         continued = resume and output.exists()  # its first frames are no longer there to be kept
-        film = None if no_report or continued else film_for(opened, output)
+        film = None
+        if not (no_report or continued):
+            from tk.report.after import film_for
+
+            film = film_for(opened, output)
         summary = session.track(opened, output, options, reporter, resume, force, film)
         if not no_report:
             draw_video_and_report(opened, output, summary, reporter, quiet, film)

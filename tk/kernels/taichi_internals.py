@@ -7,7 +7,7 @@ kernel and its context, and then passes pointers to the arrays that changed: 2 Â
 :func:`shorten_notes` halves the time in which Python transforms the kernels at each start. For each node of a kernel's
 syntax tree Taichi notes its position for error messages, with the line of code wrapped to 80 columns and underlined.
 For each call of a ``@ti.func`` it reads that function's source again. Shortened notes, for the kernels of this package,
-have file, line and code only, and each source is read once.
+have file, line and code only, and each source is read once. Functions of Taichi have them, too.
 
 :func:`quick_import` and :func:`quick_decorators` halve the time of importing Taichi and the kernels. To know whether a
 class contains a decorated function, Taichi searches the sources of all modules for the decorator's line. The caller's
@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-_OURS = "tk.", "scripts.synthetic."
+_OURS = "tk.", "scripts.synthetic.", "taichi."
 
 
 def program() -> Any:
@@ -204,22 +204,25 @@ def shorten_notes(utilities: Any, kernels: Any) -> bool:
 
 
 def _short_notes(full: Callable[[Any, Any], str]) -> Callable[[Any, Any], str]:
+    known: dict[tuple[Any, int], str] = {}  # by function and line: a line has ten nodes, and a function many callers
+
     @functools.wraps(full)
     def note(self: Any, node: Any) -> str:
         try:
-            function = self.func.func
-            if function.__module__.startswith(_OURS):
-                code = self.src[node.lineno - 1].strip()
-                return f'File "{self.file}", line {node.lineno + self.lineno_offset}, in {function.__name__}:\n{code}\n'
+            function, line = place = self.func.func, node.lineno
+            if place not in known and function.__module__.startswith(_OURS):
+                where = f'File "{self.file}", line {line + self.lineno_offset}, in {function.__name__}'
+                known[place] = f"{where}:\n{self.src[line - 1].strip()}\n"
+            return known.get(place) or full(self, node)
         except (AttributeError, IndexError):
-            pass
-        return full(self, node)
+            return full(self, node)
 
     return note
 
 
+@functools.cache
 def _fill(line: str, tabsize: int = 8, width: int = 70) -> str:
-    """Return what ``textwrap.fill`` returns, faster for lines that need no wrapping."""
+    """Return what ``textwrap.fill`` returns, faster for lines that need no wrapping, or that were asked for before."""
     spaces = line.expandtabs(tabsize).rstrip()
     if len(spaces) > width:
         return textwrap.fill(line, tabsize=tabsize, width=width)

@@ -23,11 +23,16 @@ def every(images: NDArray[Any], size: tuple[int, ...], step: int) -> NDArray[Any
     return np.stack([cv2.resize(one, (columns, rows), interpolation=cv2.INTER_NEAREST_EXACT) for one in images])
 
 
-def crop(image: NDArray[np.uint8], size: tuple[int, ...], rows: slice, columns: slice) -> NDArray[np.uint8]:
-    """Return what an image (h, w, 3) shows at some rows and columns of a camera of ``size`` (H, W), each pixel."""
+def crop(
+    image: NDArray[np.uint8], size: tuple[int, ...], rows: slice, columns: slice, step: int = 1
+) -> NDArray[np.uint8]:
+    """Return what an image (h, w, 3) shows at some rows and columns of a camera of ``size`` (H, W): every ``step``-th
+    pixel, from the first one on."""
     factor = size[0] // image.shape[0]
-    if factor == 1:
-        return image[rows, columns]
+    y, x = (range(part.start, min(part.stop, side), step) for part, side in zip((rows, columns), size, strict=False))
+    if step % factor == 0 and y[-1] < factor * image.shape[0] and x[-1] < factor * image.shape[1]:
+        apart = step // factor
+        return image[y.start // factor :: apart, x.start // factor :: apart][: len(y), : len(x)]
     top, left = rows.start // factor, columns.start // factor
     small = image[top : -(-rows.stop // factor), left : -(-columns.stop // factor)]
     shape = min(rows.stop, size[0]) - rows.start, min(columns.stop, size[1]) - columns.start
@@ -35,5 +40,5 @@ def crop(image: NDArray[np.uint8], size: tuple[int, ...], rows: slice, columns: 
     missing = max(below - small.shape[0], 0), max(right - small.shape[1], 0)
     framed = cv2.copyMakeBorder(small, 0, missing[0], 0, missing[1], cv2.BORDER_REPLICATE)
     whole = cv2.resize(framed, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
-    y, x = rows.start % factor, columns.start % factor
-    return np.asarray(whole, np.uint8)[y : y + shape[0], x : x + shape[1]]
+    y0, x0 = rows.start % factor, columns.start % factor
+    return np.asarray(whole, np.uint8)[y0 : y0 + shape[0], x0 : x0 + shape[1]][::step, ::step]

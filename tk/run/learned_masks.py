@@ -17,9 +17,10 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -60,11 +61,21 @@ _DISAGREE = 0.65
 
 @dataclass(frozen=True)
 class _Sample:
-    """What the segmenter sees in a frame; ``agrees``: (C,) whether the learned scene agrees."""
+    """What the segmenter sees in a frame.
+
+    Attributes:
+        check: compares it with the segmentation against the learned scene; called once, when the first frame needs it:
+            the first pose need not wait for the other samples.
+    """
 
     index: int
     seen: Segmented
-    agrees: Bool
+    check: Callable[[], Bool]
+
+    @cached_property
+    def agrees(self) -> Bool:
+        """(C,) whether the learned scene agrees."""
+        return self.check()
 
 
 @dataclass(frozen=True)
@@ -147,7 +158,7 @@ class LearnedMasks:
 
     def _learn(self, begin: int, stop: int) -> _Span:
         """Ask for the masks of a span's samples and learn its scene."""
-        images: list[Masks] = []
+        images: dict[int, Masks] = {}
         samples: list[_Asked] = []
         chosen = set(self._chosen(begin, stop))
         if not chosen:
@@ -157,15 +168,14 @@ class LearnedMasks:
             self._reading = self._open.enter_context(self._samples_from(begin))
         for frame in self._reading:
             if frame.index in chosen:
-                images.append(frame.images.copy())
+                images[frame.index] = frame.images.copy()
                 seen = self._next_sample(frame.images, [seen for _, seen in samples], len(samples))
                 samples.append((frame.index, seen))
             if frame.index + 1 >= stop:
                 break
         self._next = stop
-        foreground = self._foreground(images, samples)
-        checked = tuple(_checked(foreground, *pair) for pair in zip(images, samples, strict=True))
-        return _Span(begin, stop, foreground, checked)
+        foreground = self._foreground(list(images.values()), samples)
+        return _Span(begin, stop, foreground, tuple(_checked(foreground, images, each) for each in samples))
 
     def _samples_from(self, begin: int) -> AbstractContextManager[Iterator[FrameSet]]:
         """Return the samples of the spans from frame ``begin`` on; with all frames between them if the source cannot
@@ -193,7 +203,7 @@ class LearnedMasks:
         foreground = self._span.foreground
         if self._asked >= _LEAST and self._asked % _EVERY == 0:
             foreground = self._foreground([image for image, _ in self._past], [each for _, each in self._past])
-        checked = _checked(foreground, frame.images, sample)
+        checked = _checked(foreground, {frame.index: self._past[-1][0]}, sample)
         self._span = _Span(frame.index, frame.index + max(round(_STEP_S * self._fps), 1), foreground, (checked,))
         return self._span
 
@@ -212,14 +222,19 @@ class LearnedMasks:
         return [begin + (frames - 1) * k // (count - 1) for k in range(count)]
 
 
-def _checked(foreground: CollinearityForeground | None, images: Masks, asked: _Asked) -> _Sample:
-    """Return a sample, compared with the segmentation of its images against the learned scene."""
+def _checked(foreground: CollinearityForeground | None, images: dict[int, Masks], asked: _Asked) -> _Sample:
+    """Return a sample, whose check takes its images out of the ``images`` by number."""
     index, seen = asked
-    if foreground is None:
-        return _Sample(index, seen, np.zeros(len(seen.masks), np.bool_))
-    found = foreground.label(images, prior=(seen.masks, seen.uncertain))[0]
-    one, either = (np.count_nonzero(pixels, axis=(1, 2)) for pixels in (found ^ seen.masks, found | seen.masks))
-    return _Sample(index, seen, one <= _DISAGREE * either)
+
+    def check() -> Bool:
+        shown = images.pop(index)
+        if foreground is None:
+            return np.zeros(len(seen.masks), np.bool_)
+        found = foreground.label(shown, prior=(seen.masks, seen.uncertain))[0]
+        one, either = (np.count_nonzero(pixels, axis=(1, 2)) for pixels in (found ^ seen.masks, found | seen.masks))
+        return np.asarray(one <= _DISAGREE * either)
+
+    return _Sample(index, seen, check)
 
 
 def _edges(first: int, count: int | None, fps: float) -> list[int]:

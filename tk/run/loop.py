@@ -217,13 +217,18 @@ class Loop:
                     written = stepped + writing
                     yield from finished
                     finished.clear()
-        except TkError:  # frames before the broken one count
-            yield from self._flushed(finished)
+        except TkError:  # frames before the broken one count; the state may be that of a part of its step
+            if output and self.written:
+                output.writer.flush()
+            yield from finished
             raise
-        yield from self._flushed(finished)
+        if output and self.written:
+            output.writer.flush(self._state(output))
+        yield from finished
 
     def _write(self, output: Output, flush: bool) -> None:
-        """Write the frames that are not in the file yet, and the bodies of people whose trackers have just started."""
+        """Pass on the frames that are not in the file yet, and the bodies of people whose trackers have just started;
+        with ``flush``, and at first, the state, too, which takes longer than the rows of a frame."""
         models = output.writer.models
         for person in self.people.written:
             if person.number >= len(models) or not models[person.number]:
@@ -231,7 +236,8 @@ class Loop:
         *earlier, last = self._held
         for before in earlier:
             output.writer.append(*before, flush=False)
-        output.writer.append(*last, self._state(output), flush=flush)
+        state = self._state(output) if flush or not self.written else None
+        output.writer.append(*last, state, flush=flush)
         self.written += len(self._held)
         self._held.clear()
 
@@ -266,12 +272,6 @@ class Loop:
             taken = taken.copy()
             taken[out] = tracker.cleaned(answer.share.masks[out])
         return taken
-
-    def _flushed(self, finished: list[tuple[Estimate, ...]]) -> Iterator[tuple[Estimate, ...]]:
-        """Yield the estimates that are finished, after they are in the file."""
-        if self.output and self.written:
-            self.output.writer.flush()
-        yield from finished
 
     def _state(self, output: Output) -> Mapping[str, Value]:
         origin = {_ORIGIN + name: value for name, value in output.origin.items()}

@@ -27,7 +27,10 @@ INSTALL = "pip install tk-mocap[segmenter]"
 
 
 class Segmenter(Protocol):
-    """Estimates which pixels show a person."""
+    """Estimates which pixels show a person.
+
+    With an attribute ``parallel`` that is true, several threads call it at once.
+    """
 
     def segment(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the probability (h, w) that each pixel of an image (h, w, 3) BGR shows a person.

@@ -27,9 +27,10 @@ No state is kept between frames, so a resumed run sees the same masks.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -42,7 +43,9 @@ from tk.model.cameras.volume import Volume
 from tk.model.hull.coarse import CoarseHull
 from tk.model.masks.sightings import Patch, SeenPerson, Sighting, locate, volume_patch
 from tk.segmenters import Finder, Segmenter, segmented
+from tk.system.machine import cores
 
+T = TypeVar("T")
 Images = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 
@@ -114,6 +117,12 @@ class PeopleMasks:
         self._rig, self._volume = rig, volume
         self._hull = CoarseHull(rig, volume)
         self._whole = [volume_patch(camera, volume) for camera in rig]
+        parallel = getattr(segmenter, "parallel", False)
+        self._threads = ThreadPoolExecutor(min(cores(), len(rig)), "tk-segment") if parallel else None
+
+    def _each(self, see: Callable[[int], T], cameras: Sequence[int]) -> list[T]:
+        """Return what ``see`` returns for each of some cameras; at once, if the segmenter can be called so."""
+        return list((self._threads.map if self._threads else map)(see, cameras))
 
     def segment(self, images: Images) -> Images:
         """Return the masks (C, H, W) uint8, 0 or 255, of images (C, H, W, 3) uint8 BGR.
@@ -156,8 +165,7 @@ class PeopleMasks:
     def _people(self, images: Images, expected: Sequence[SeenPerson], turn: int) -> list[_Person]:
         if not isinstance(self._segmenter, Finder):
             everybody = self._empty(self._whole)
-            for c in range(len(images)):
-                self._segment(images, c, everybody)
+            self._each(lambda c: self._segment(images, c, everybody), range(len(images)))
             self._compare(images, everybody, range(len(images)))
             return [everybody]
         left, every = images.copy(), range(len(images))
@@ -170,11 +178,9 @@ class PeopleMasks:
         sightings: list[list[Sighting]] = [[] for _ in self._rig]
         cameras = list(every)[turn % 2 :: 2] if all_there else list(every)
         for _ in range(_ROUNDS):
-            for c in cameras:
-                sightings[c] += self._sightings(left, c)
+            self._find(left, cameras, sightings)
             if any(sightings) and len(cameras) < len(images):
-                for c in set(every) - set(cameras):
-                    sightings[c] += self._sightings(left, c)
+                self._find(left, sorted(set(every) - set(cameras)), sightings)
             cameras = list(every)
             located, sightings = locate(self._rig, self._volume, sightings)
             new = [person for seen in located if (person := self._look(left, seen, people))]
@@ -199,6 +205,11 @@ class PeopleMasks:
                     alone.append(person)
         return alone
 
+    def _find(self, left: Images, cameras: Sequence[int], sightings: list[list[Sighting]]) -> None:
+        """Add the people in the images of some cameras to the sightings of all cameras."""
+        for c, found in zip(cameras, self._each(lambda c: self._sightings(left, c), cameras), strict=True):
+            sightings[c] += found
+
     def _sightings(self, images: Images, c: int) -> list[Sighting]:
         """Return the people in the part of an image that shows the volume."""
         assert isinstance(self._segmenter, Finder)
@@ -214,8 +225,7 @@ class PeopleMasks:
         Where the square does not hold the sphere around the person, the segmenter gets the right one.
         """
         person, cameras = self._empty(self._patches(place)), range(len(left))
-        for c in cameras:
-            self._segment(left, c, person)
+        self._each(lambda c: self._segment(left, c, person), cameras)
         here = SeenPerson.at(self._agreement(person).points)
         if here is None:
             return None
@@ -234,14 +244,12 @@ class PeopleMasks:
     def _look(self, left: Images, seen: SeenPerson, people: Sequence[_Person]) -> _Person | None:
         """Return the masks of a person in the images that are left; None if they show nobody new."""
         person = self._empty(self._patches(seen))
-        for c in seen.cameras:
-            self._segment(left, c, person)
+        self._each(lambda c: self._segment(left, c, person), seen.cameras)
         self._compare(left, person, seen.cameras)
         if people and np.count_nonzero(self._new_views(person, people)) < 2:
             return None
-        for c in range(len(left)):
-            if c not in seen.cameras:
-                self._segment(left, c, person)
+        others = [c for c in range(len(left)) if c not in seen.cameras]
+        self._each(lambda c: self._segment(left, c, person), others)
         self._compare(left, person, range(len(left)))
         return self._carved(person)
 
@@ -310,8 +318,7 @@ class PeopleMasks:
 
     def _paint_over(self, images: Images, person: _Person) -> None:
         """Paint a person over in images (C, H, W, 3)."""
-        for c, image in enumerate(images):
-            self._paint(image, c, person.masks[c], person.patches[c])
+        self._each(lambda c: self._paint(images[c], c, person.masks[c], person.patches[c]), range(len(images)))
 
     def _paint(self, image: Images, c: int, mask: Images, patch: Patch) -> None:
         """Paint a mask (H, W) over in an image (H, W, 3), with the mean colour of the other pixels."""

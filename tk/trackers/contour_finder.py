@@ -275,10 +275,12 @@ class ContourFinder:
         chosen: NDArray[np.int64],
         stature: float,
         stature_deviation: float = STATURE_DEVIATION,
+        body: ConeBody | None = None,
     ) -> FittedBody:
-        """Fit the body to the chosen ones of several frames."""
+        """Fit the body to the chosen ones of several frames, arguments as for
+        :func:`~tk.model.body.body_fit.fit_body`."""
         seen = [pyramids[i] for i in chosen]
-        return fit_body(self.views, seen, poses[chosen], self.line_search, stature, stature_deviation)
+        return fit_body(self.views, seen, poses[chosen], self.line_search, stature, stature_deviation, body)
 
     # --- one frame ----------------------------------------------------------------------------------------------
 

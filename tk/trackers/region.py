@@ -315,13 +315,14 @@ class RegionTracker(ContourTracker[RegionState]):
         masks, uncertain = frame.masks, np.zeros(0, np.bool_)
         for c in np.unique(view[unknown]):
             # one ray more on each side: the mask ends between two rays
-            box = tuple(
+            rows, columns = (
                 slice(max(rays[0] - 1, 0) * grid.step, (rays[-1] + 2) * grid.step)
                 for rays in (np.flatnonzero(person[c].any(axis=axis)) for axis in (1, 0))
             )
+            box = rows, columns
             # a quarter of the pixels shows objects that are wider than six pixels; narrower ones are ignored
-            coarse = crop(frame.images[c], masks.shape[1:], *box)[::2, ::2]
-            odd_pixels = foreign[color_bins(coarse)] & (masks[c][box][::2, ::2] >= PERSON)
+            coarse = crop(frame.images[c], masks.shape[1:], rows, columns, step=2)
+            odd_pixels = foreign.take(color_bins(coarse)) & (masks[c][box][::2, ::2] >= PERSON)
             opened = np.asarray(cv2.morphologyEx(odd_pixels.view(np.uint8), cv2.MORPH_OPEN, SQUARE3), np.uint8)
             if not opened.any():
                 continue

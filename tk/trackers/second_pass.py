@@ -157,7 +157,7 @@ class SecondPass:
         stature = height_m or tracker.body.dimensions.barefoot
         deviation = STATURE_DEVIATION if height_m else STATURE
         seen = [self._pyramid(i) for i in chosen]
-        fitted = tracker.fit(seen, self.poses[chosen], np.arange(len(chosen)), stature, deviation)
+        fitted = tracker.fit(seen, self.poses[chosen], np.arange(len(chosen)), stature, deviation, tracker.body)
         tracker.take_body(fitted.body)
         if self._few:
             self._constant += fitted.variance() / len(tracked)

@@ -173,6 +173,16 @@ def test_lengths_of_a_known_body_are_recovered(monkeypatch):
     assert found.dimensions.stature == pytest.approx(true.stature, rel=0.01)
 
 
+def test_a_fit_with_other_frames_begins_at_the_body(monkeypatch):
+    monkeypatch.setattr(body_fit, "ROUNDS_AGAIN", 0)
+    body, poses = build_cone_body(scaled(AVERAGE.dimensions, thigh=0.9, thigh_radius=1.3)), walk(AVERAGE, 1)
+    change = np.random.default_rng(0).normal(0.0, 0.01, (len(body.shape_groups), 8))
+    body = body.reshaped(change)
+    found, _, _ = fit_body(VIEWS, pyramids_of(body, poses), poses, SEARCH, STATURE, body=body)
+    np.testing.assert_allclose(found.dimensions.values, body.dimensions.values)
+    np.testing.assert_allclose(found.shape, body.shape, atol=1e-4)
+
+
 @pytest.mark.parametrize("wrong", [0.96, 1.04])
 def test_silhouettes_outweigh_a_wrong_height(wrong: float) -> None:
     poses = walk(AVERAGE, 4)

@@ -39,6 +39,21 @@ def test_grids_sample_the_middle_of_their_squares():
     assert sampled[1, 2, 3] == pictures[1, 2 + 8, 2 + 12]
 
 
+def test_cues_are_asked_for_poses_only_that_the_rays_do_not_refuse():
+    class Cue:
+        def cost(self, poses):
+            asked.append(len(poses))
+            return poses[:, 0]
+
+    asked, evidence = [], Evidence.of(FINE, MASKS, cues=(Cue(),))
+    mismatch, poses = np.array([0.2, np.inf, 0.1]), np.repeat(POSE[None], 3, axis=0)
+    poses[:, 0] = 1.0, 2.0, 3.0
+    without = Evidence.of(FINE, MASKS).cost_of(mismatch, poses)
+    np.testing.assert_array_equal(evidence.cost_of(mismatch, poses), without + poses[:, 0])
+    assert asked == [2] and np.isinf(without[1])
+    assert np.isinf(evidence.cost_of(mismatch[1:2], poses[1:2])).all() and asked == [2]
+
+
 def test_without_colors_the_cost_is_the_papers_error():
     evidence = Evidence.of(FINE, MASKS)
     total, (mean, met) = by_view(evidence), evidence.cast(BODY, POSES)

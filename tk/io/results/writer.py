@@ -157,15 +157,14 @@ class ResultWriter:
         self._add_people(1 + max(people, default=0))
         self._waiting.append((row, rows))
         self._frames += 1
-        if state is not None:
-            copy = {name: value if isinstance(value, str) else np.array(value) for name, value in state.items()}
-            self._waiting_state = (self._frames, len(self.models), copy)
+        self._keep(state)
         if flush:
             self.flush()
 
-    def flush(self) -> None:
-        """Write all appended frames to the file."""
+    def flush(self, state: Mapping[str, Value] | None = None) -> None:
+        """Write all appended frames to the file, and the state after them as for :meth:`append`."""
         self._require_open()
+        self._keep(state)
         try:
             with writing(self.path):
                 self._write_waiting()
@@ -198,6 +197,12 @@ class ResultWriter:
                 self._write_waiting()
             else:
                 self._disk.close(publish=False)
+
+    def _keep(self, state: Mapping[str, Value] | None) -> None:
+        """Keep a copy of the state after the frames so far, if there is one."""
+        if state is not None:
+            copy = {name: value if isinstance(value, str) else np.array(value) for name, value in state.items()}
+            self._waiting_state = (self._frames, len(self.models), copy)
 
     def _require_open(self) -> None:
         if not self._disk.file:

@@ -37,8 +37,8 @@ INFORMATIVE_FRAMES = 8
 # Prior standard deviation of the logarithm of the stature about a given height: 2.5 cm, of shoes, hair, posture and the
 # measurement.
 STATURE_DEVIATION = 0.015
-# Gauss-Newton iterations.
-ROUNDS = 6
+# Gauss-Newton iterations from an average body, and from one that was fitted to other frames of the person.
+ROUNDS, ROUNDS_AGAIN = 6, 3
 
 
 class FittedBody(NamedTuple):
@@ -63,6 +63,7 @@ def fit_body(
     settings: SearchSettings,
     stature_m: float,
     stature_deviation: float = STATURE_DEVIATION,
+    body: ConeBody | None = None,
 ) -> FittedBody:
     """Fit a body and poses to several frames.
 
@@ -73,11 +74,15 @@ def fit_body(
         settings: of the edge search.
         stature_m: the subject's height without shoes, given or estimated, metres.
         stature_deviation: prior standard deviation of the logarithm of the stature about ``stature_m``.
+        body: the person's body, which other frames have shown, to which the poses belong; None: the average one.
     """
+    family = BodyFamily(BodyDimensions.from_stature(stature_m), stature_deviation)
+    if body is not None:
+        family.begun_at(body)
 
     def bundle(segment_m: float | None) -> ContourBundle:
         return ContourBundle(
-            BodyFamily(BodyDimensions.from_stature(stature_m), stature_deviation),
+            family,
             views.rig,
             [BundleFrame(pyramid, pose, np.zeros_like(pose)) for pyramid, pose in zip(pyramids, poses, strict=True)],
             replace(settings, spacing_px=SPACING_PX),
@@ -87,8 +92,9 @@ def fit_body(
         )
 
     stiff = bundle(None)
-    state = minimise(stiff.start, stiff.linearise, stiff.move, [0] * ROUNDS, LONGEST_STEP).state
-    return FittedBody(stiff.family.build(state.body), state.poses, lambda: _joint_variance(bundle(SEGMENT_M), state))
+    rounds = ROUNDS if body is None else ROUNDS_AGAIN
+    state = minimise(stiff.start, stiff.linearise, stiff.move, [0] * rounds, LONGEST_STEP).state
+    return FittedBody(family.build(state.body), state.poses, lambda: _joint_variance(bundle(SEGMENT_M), state))
 
 
 def _joint_variance(bundle: ContourBundle, state: BundleState) -> Float:

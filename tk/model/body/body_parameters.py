@@ -72,9 +72,12 @@ class BodyFamily:
     @staticmethod
     def around(body: ConeBody, stature_deviation: float) -> BodyFamily:
         """Return the family whose prior is about a body's dimensions and which begins at the body."""
-        family = BodyFamily(body.dimensions, stature_deviation)
-        family.start[len(DIMENSIONS) :] = shapes_of(body).ravel()
-        return family
+        return BodyFamily(body.dimensions, stature_deviation).begun_at(body)
+
+    def begun_at(self, body: ConeBody) -> BodyFamily:
+        """Begin at a body; return the family."""
+        self.start = np.concatenate([np.log(body.dimensions.values), shapes_of(body).ravel()])
+        return self
 
     def build(self, shared: Float) -> ConeBody:
         """Return the body with parameters (K,)."""

@@ -142,18 +142,18 @@ class Skeleton:
     def transforms(self, pose: Float) -> Float:
         """Return the transforms T_k (..., D, 4, 4) after each degree of freedom of poses (..., D), float64."""
         pose = np.asarray(pose, dtype=np.float64)
-        if pose.ndim > 1:
+        if pose.size != pose.shape[-1]:
             return self._transforms(pose)
         # joints, twists and directions of one pose are asked for in turn, and the joints once more in the next frame
         key = pose.tobytes()
         placed = self._placed.get(key)
         if placed is None:
-            placed = self._transforms(pose)
+            placed = self._transforms(pose.reshape(-1))
             placed.flags.writeable = False
             if len(self._placed) >= REMEMBERED:
                 self._placed.pop(next(iter(self._placed)), None)
             self._placed[key] = placed
-        return placed
+        return placed.reshape(*pose.shape, 4, 4)
 
     @cached_property
     def _placed(self) -> dict[bytes, Float]:
@@ -244,8 +244,8 @@ class Skeleton:
             segment: (N,) the segment that carries each point.
             place: (N, 3) the points in the zero configuration, metres.
         """
-        T = self.segment_transforms(pose)[..., segment, :, :]
-        return np.asarray((T[..., :3, :3] @ place[:, :, None])[..., 0] + T[..., :3, 3])
+        T = self.transforms(pose)[..., self.segment_dof[segment], :3, :]
+        return np.asarray((T[..., :3] @ place[:, :, None])[..., 0] + T[..., 3])
 
     def apart(self, poses: Float, joints: Float) -> Float:
         """Return the largest distance (...) of the joints of poses (..., D) from others (J, 3), metres."""

@@ -152,9 +152,13 @@ class Evidence:
         return self.cost_of(self.mismatch(body, poses, drawn, before, most_outside), poses)
 
     def cost_of(self, mismatch: Float, poses: Float) -> Float:
-        """Return :meth:`cost` of poses (B, D) with a :meth:`mismatch` (B,)."""
-        views = max(int(np.count_nonzero(self._seen)), 1)
-        return np.asarray(VIEW_NATS * views * mismatch + sum(cue.cost(poses) for cue in self.cues))
+        """Return :meth:`cost` of poses (B, D) with a :meth:`mismatch` (B,). The cues are asked only where it is finite:
+        of the candidates of a limb most are refused."""
+        cost = np.asarray(VIEW_NATS * max(int(np.count_nonzero(self._seen)), 1) * mismatch)
+        finite = np.isfinite(cost)
+        if self.cues and finite.any():
+            cost[finite] += sum(cue.cost(poses[finite]) for cue in self.cues)
+        return cost
 
     def cast(self, body: ConeBody, poses: Float, drawn: NDArray[np.int32] | None = None) -> tuple[Float, Cast]:
         """Return the :meth:`mismatch` (B,) of poses, and the parts that the rays meet."""

@@ -6,6 +6,7 @@ numbers of pixels.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import cv2
@@ -87,15 +88,14 @@ def person_parts(mask: Mask, statistic: Images, starts: NDArray[np.integer], see
         (h, w) uint8, 0 or 1.
     """
     outlines, holes = _outlines(mask.view(np.uint8))
-    areas = np.array([_area(outline) for outline in outlines])
-    boxes = np.array([cv2.boundingRect(outline) for outline in outlines]).reshape(-1, 4)
+    large, dropped = _by_size(outlines, area_min)
+    boxes = np.array([cv2.boundingRect(outline) for outline in large]).reshape(-1, 4)
     image = np.searchsorted(starts, boxes[:, 0], side="right")
-    by_area = np.argsort(areas, kind="stable")
+    by_area = np.argsort([_area(outline) for outline in large], kind="stable")
     largest = set(dict(zip(image[by_area].tolist(), by_area.tolist(), strict=True)).values())
-    dropped = []
-    for k in by_area:
-        if areas[k] < area_min or (k not in largest and not _is_strong(outlines[k], boxes[k], mask, statistic, seed)):
-            dropped.append(outlines[k])
+    for k, outline in enumerate(large):
+        if k not in largest and not _is_strong(outline, boxes[k], mask, statistic, seed):
+            dropped.append(outline)
     result = mask.view(np.uint8).copy()
     _mend(result, holes, area_min, dropped, 1)
     return result
@@ -104,11 +104,24 @@ def person_parts(mask: Mask, statistic: Images, starts: NDArray[np.integer], see
 def _is_strong(outline: NDArray[Any], box: NDArray[np.int_], mask: Mask, statistic: Images, seed: float) -> bool:
     """Return whether a pixel of the part within an outline has a strong statistic."""
     x, y, w, h = box
+    here = slice(y, y + h), slice(x, x + w)
+    strong = mask[here] & (statistic[here] >= level_of(seed))
+    if not strong.any():
+        return False
     part = np.zeros((h, w), np.uint8)
     cv2.drawContours(part, [outline], 0, 1, cv2.FILLED, offset=(-int(x), -int(y)))
-    here = slice(y, y + h), slice(x, x + w)
-    strong = part.view(np.bool_) & mask[here] & (statistic[here] >= level_of(seed))
-    return bool(strong.any())
+    return bool((strong & part.view(np.bool_)).any())
+
+
+def _by_size(outlines: list[NDArray[Any]], least: float) -> tuple[list[NDArray[Any]], list[NDArray[Any]]]:
+    """Return the outlines with an area of ``least`` pixels or more, and the others."""
+    large: list[NDArray[Any]] = []
+    small: list[NDArray[Any]] = []
+    for outline in outlines:
+        count = len(outline)  # a circle of as many diagonal steps has the largest area
+        is_large = count**2 / (2 * math.pi) + count / 2 + 1 >= least and _area(outline) >= least
+        (large if is_large else small).append(outline)
+    return large, small
 
 
 def _area(outline: NDArray[Any]) -> float:
@@ -126,11 +139,8 @@ def clean_by_area(mask: Mask, speck: float, hole: float, relative: bool = False)
     """
     clean = mask.view(np.uint8) * np.uint8(255)
     outer, inner = _outlines(clean)
-    areas = [_area(outline) for outline in outer]
-    unit = max(areas, default=1.0) if relative else 1.0
-    _mend(
-        clean, inner, hole * unit, [each for each, area in zip(outer, areas, strict=True) if area < speck * unit], 255
-    )
+    unit = max(map(_area, outer), default=1.0) if relative else 1.0
+    _mend(clean, inner, hole * unit, _by_size(outer, speck * unit)[1], 255)
     return clean
 
 
