@@ -383,6 +383,7 @@ def test_cameras_on_their_side_leave_the_default_up(make_capture: MakeCapture) -
 # -------------------------------------------------------------------------------------------------- shared captures
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "cameras", "frames", "masks", "background"),
     [
