@@ -5,6 +5,9 @@ RUN = "$(VENV)/bin/python" -m
 # again, because the new one would repeat the test that crashed it
 EACH_CORE = -n auto --dist loadfile --max-worker-restart 0
 
+# compiled modules are kept: each process that a test starts would compile tk again
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: help install demo test test-slow test-random lint format docs bench clean
 .DEFAULT_GOAL := help
 

@@ -35,9 +35,8 @@ from tk.system.machine import cores
 if TYPE_CHECKING:
     from tk.run.session import Summary
 
-# every run uses the same examples, and none fails because the machine is slow; `pytest --hypothesis-profile default`
-# draws new ones
-hypothesis.settings.register_profile("same", derandomize=True, deadline=None)
+# every run uses the same few examples, and none fails because the machine is slow; `make test-random` draws new ones
+hypothesis.settings.register_profile("same", derandomize=True, deadline=None, max_examples=25)
 hypothesis.settings.load_profile("same")
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # set before any kernel runs; results do not depend on the number of threads

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -25,22 +26,30 @@ SIZE = (160, 120)
 # --- the main job -----------------------------------------------------------------------------------------------------
 
 
-def test_track_writes_a_complete_result(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
-    result = tmp_path / "result.h5"
-    ran = tk("track", tiny, "-o", result, "--config", quick, "--frames", "2:8", "--seed", "5")
+def test_track_writes_a_complete_result(tk: Tk, tiny: Path, tmp_path: Path) -> None:
+    """Its options override the settings file, and each stage is printed before the first frame."""
+    folder = tmp_path / "results"
+    folder.mkdir()
+    result, settings = folder / "result.h5", tmp_path / "settings.toml"
+    settings.write_text(f"seed = 3\n{QUICK}prediction = 0\n".replace("32", "40"), encoding="utf-8")
+    ran = tk("track", tiny, "-o", result, "--config", settings, "--frames", "2:6", "--seed", "5", "--voxels", "32")
     assert ran.code == 0, ran.err
     assert ran.out == ""  # progress is no result
     lines = ran.err.splitlines()
+    stages = [re.sub(r"^\[ *[\d.]+ s\] ", "", line) for line in lines]
+    assert stages[:2] == ["loading", f"opening {tiny}"]
+    begun = next(i for i, line in enumerate(lines) if line.startswith("frame 2: "))
+    assert any("finding the person in frame 0" in line for line in stages[:begun])
     assert all(line.isprintable() for line in lines)  # plain lines, no bar, because stderr is not a terminal
-    done = next(i for i, line in enumerate(lines) if line.startswith("frame 7: 6/6, "))
+    done = next(i for i, line in enumerate(lines) if line.startswith("frame 5: 4/4, "))
     assert "second pass" in lines[done + 1] and ran.messages == lines[-1:]
-    assert lines[-1].startswith(f"6 frames in {result}, 0 lost, ")
-    assert {path.name for path in tmp_path.iterdir()} == {"result.h5"}  # --no-report
+    assert lines[-1].startswith(f"4 frames in {result}, 0 lost, ")
+    assert {path.name for path in folder.iterdir()} == {"result.h5"}  # --no-report
     found = read_result(result)
     assert (found.meta.capture, found.meta.method, found.meta.seed, found.meta.fps) == ("demo", "region", 5, 15.0)
-    assert found.pose.shape == (6, 32) and found.meta.joint_names == JOINTS and len(found.meta.residual_cameras) == 4
-    np.testing.assert_array_equal(found.frames, np.arange(2, 8))
-    np.testing.assert_allclose(found.time, np.arange(2, 8) / 15.0)
+    assert found.pose.shape == (4, 32) and found.meta.joint_names == JOINTS and len(found.meta.residual_cameras) == 4
+    np.testing.assert_array_equal(found.frames, np.arange(2, 6))
+    np.testing.assert_allclose(found.time, np.arange(2, 6) / 15.0)
     for name in ("pose", "joints", "sigma", "residual", "objective"):
         assert np.isfinite(getattr(found, name)).all(), name
     assert set(found.status) == {0}  # the initial frame was left out
@@ -50,7 +59,7 @@ def test_track_writes_a_complete_result(tk: Tk, quick: Path, tiny: Path, tmp_pat
     assert dimensions and all(abs(value) < 2.5 for value in dimensions)
     assert found.model["parts/shape"].shape[1] == 4 and found.hull is None
     config = settings_file.from_toml(found.meta.config_toml)
-    assert (config.voxels, config.seed) == (32, 5) and __version__ in found.software
+    assert (config.voxels, config.seed, config.silhouette.prediction) == (32, 5, 0.0) and __version__ in found.software
 
 
 def test_track_without_output_takes_the_name_of_the_folder(
@@ -81,27 +90,16 @@ def test_track_finds_the_person(tk: Tk, tracked: Path, tiny: Path) -> None:
     assert f"{FRAMES} frames judged: 0 lost" in table.out
 
 
-def test_masks_from_a_folder_and_chosen_cameras_are_used(tk: Tk, quick: Path, copy: Path, tmp_path: Path) -> None:
+def test_masks_from_a_folder_and_chosen_cameras_are_used(
+    tk: Tk, quick: Path, copy: Path, causal: Path, tmp_path: Path
+) -> None:
     shutil.move(copy / "masks", tmp_path / "mine")
     shutil.rmtree(copy / "background")  # masks could not be made from the videos
-    first, second = tmp_path / "a.h5", tmp_path / "b.h5"
-    command = ["track", copy, "--config", quick, "--frames", ":5", "--causal", "--masks", tmp_path / "mine"]
-    assert tk(*command, "-o", first).code == 0
-    assert tk(*command, "-o", second, "--cameras", "cam1, cam2,cam4").code == 0
-    with h5py.File(first, "r") as a, h5py.File(second, "r") as b:
-        assert np.abs(a["joints/position"][()] - b["joints/position"][()]).max() > 1e-6
+    command = ["track", copy, "--config", quick, "--frames", ":3", "--causal", "--masks", tmp_path / "mine"]
+    assert tk(*command, "-o", tmp_path / "r.h5", "--cameras", "cam1, cam2,cam4").code == 0
+    with h5py.File(causal, "r") as a, h5py.File(tmp_path / "r.h5", "r") as b:
+        assert np.abs(a["joints/position"][:3] - b["joints/position"][()]).max() > 1e-6
         assert (b["status"][()] < 3).all()
-
-
-def test_options_override_the_settings_file(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
-    settings = tmp_path / "settings.toml"
-    settings.write_text(f"seed = 3\n{QUICK}prediction = 0\n".replace("32", "40"), encoding="utf-8")
-    result = tmp_path / "r.h5"
-    ran = tk("track", tiny, "-o", result, "--config", settings, "--voxels", "32", "--frames", ":1", "--causal")
-    assert ran.code == 0, ran.err
-    with h5py.File(result, "r") as file:
-        config = settings_file.from_toml(file.attrs["config"])
-    assert (config.voxels, config.seed, config.silhouette.prediction) == (32, 3, 0.0)
 
 
 def test_version(tk: Tk) -> None:
@@ -214,7 +212,7 @@ def test_error_of_a_bad_capture_is_one_line_with_the_file(
     assert list(tmp_path.iterdir()) == [copy]
 
 
-@pytest.mark.parametrize("broken", [2, 7])
+@pytest.mark.parametrize("broken", [2, 6])
 def test_finished_frames_are_kept_when_a_file_is_damaged(
     tk: Tk, quick: Path, copy: Path, tmp_path: Path, broken: int
 ) -> None:
@@ -223,7 +221,7 @@ def test_finished_frames_are_kept_when_a_file_is_damaged(
     good = mask.read_bytes()
     mask.write_bytes(good[: len(good) // 3])
     result = tmp_path / "r.h5"
-    command = ["track", copy, "-o", result, "--config", quick, "--frames", ":9"]
+    command = ["track", copy, "-o", result, "--config", quick, "--frames", ":7", "--causal"]
     tk(*command).complaint(str(mask))
     with h5py.File(result, "r") as file:
         np.testing.assert_array_equal(file["frames"], np.arange(broken))
@@ -231,7 +229,7 @@ def test_finished_frames_are_kept_when_a_file_is_damaged(
         mask.write_bytes(good)
         assert tk(*command, "--resume").code == 0
         with h5py.File(result, "r") as file:
-            assert len(file["frames"]) == 9
+            assert len(file["frames"]) == 7
 
 
 # --- damaged results --------------------------------------------------------------------------------------------------
@@ -260,16 +258,12 @@ def test_resume_refuses_a_damaged_state(
 ) -> None:
     result = tmp_path / "r.h5"
     command = ["track", tiny, "-o", result, "--config", quick, *options]
-    assert tk(*command, "--frames", ":2").code == 0
+    assert tk(*command, "--frames", ":1").code == 0
     good = result.read_bytes()
-    for name, value in [
-        *own,
-        ("people/0/pose", np.zeros((2, 3))),
-        ("pose", np.zeros((2, 3))),
-    ]:
+    for name, value in [*own, ("people/0/pose", np.zeros((2, 3))), ("pose", np.zeros((2, 3)))]:
         result.write_bytes(good)
         spoil(result, name, value)
-        tk(*command, "--frames", ":4", "--resume").complaint("r.h5")
+        tk(*command, "--frames", ":2", "--resume").complaint("r.h5")
 
 
 def test_evaluate_names_files_that_cannot_be_read(tk: Tk, tracked: Path, tiny: Path, tmp_path: Path) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import open3d
 import pytest
 
 from tests.conftest import Tk
@@ -16,11 +16,15 @@ from tk.errors import ExportError
 from tk.export import export
 
 
-def read(path: Path) -> open3d.geometry.TriangleMesh:
+def read(path: Path) -> Any:
+    import open3d  # takes seconds, which each worker that collects the tests would need
+
     return open3d.io.read_triangle_mesh(path)
 
 
 def test_mesh_of_each_frame_lies_on_the_body(write: Write) -> None:
+    import open3d
+
     path = write()
     (folder,) = export(path, ["ply"]).files
     assert folder.name == "walk_ply"

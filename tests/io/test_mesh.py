@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-import open3d
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -26,7 +27,9 @@ def surface_of(occupancy: np.ndarray, grid: VoxelGrid = GRID) -> HullPoints:
     return HullPoints(grid.centers(flat), colors)
 
 
-def legacy(mesh: Mesh) -> open3d.geometry.TriangleMesh:
+def legacy(mesh: Mesh) -> Any:
+    import open3d  # takes seconds, which each worker that collects the tests would need
+
     return open3d.geometry.TriangleMesh(
         open3d.utility.Vector3dVector(mesh.vertices), open3d.utility.Vector3iVector(mesh.triangles)
     )

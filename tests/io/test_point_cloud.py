@@ -5,7 +5,6 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-import open3d
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -27,6 +26,8 @@ def points(count: int, seed: int = 0) -> HullPoints:
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=20)
 @given(count=st.integers(0, 40), faces=st.integers(0, 30), seed=st.integers(0, 1000))
 def test_open3d_reads_points_and_meshes(tmp_path: Path, count: int, faces: int, seed: int) -> None:
+    import open3d  # takes seconds, which each worker that collects the tests would need
+
     expected = points(count, seed)
     triangles = np.random.default_rng(seed).integers(0, max(count, 1), (faces if count else 0, 3))
     for path, corners in ((tmp_path / "a" / "points.ply", None), (tmp_path / "a" / "mesh.ply", triangles)):

@@ -3,7 +3,6 @@
 import functools
 
 import numpy as np
-import open3d as o3d
 import pytest
 
 from tests.kernels import oracles
@@ -133,6 +132,9 @@ class MeshedBody:
     """The body at one pose as an Open3D scene with a geometry for each piece."""
 
     def __init__(self, body, pose):
+        import open3d as o3d  # takes seconds, which each worker that collects the tests would need
+
+        self.tensor = o3d.core.Tensor
         self.scene = o3d.t.geometry.RaycastingScene()
         for piece, M in zip(body.pieces, piece_transforms(body, pose), strict=True):
             vertices, faces = mesh(piece)
@@ -146,7 +148,7 @@ class MeshedBody:
         if len(p_world) == 0:
             return np.zeros(0, bool)  # Open3D crashes on no rays
         rays = np.column_stack([np.broadcast_to(center, p_world.shape), p_world - center]).astype(np.float32)
-        hits = self.scene.list_intersections(o3d.core.Tensor(rays))
+        hits = self.scene.list_intersections(self.tensor(rays))
         ray, t, geometry = (hits[key].numpy().astype(float) for key in ("ray_ids", "t_hit", "geometry_ids"))
         ray = ray.astype(int)
         before = (t < 1) & (geometry.astype(int) != own[ray])

@@ -28,28 +28,22 @@ def run(code, **environment):
 
 
 STATE = """
+    import threading, urllib.request
+    urllib.request.urlopen = lambda *_, **__: print("asked")
+    import tk.kernels.objective, tk.model.cues.objective, tk.model.body.initial_pose
     from tk.kernels.runtime import ensure_runtime, ti
+    print(ti.lang.impl.get_runtime().prog is None)
     ensure_runtime()
     ensure_runtime()
     config = ti.lang.impl.current_cfg()
+    [thread.join(5) for thread in threading.enumerate() if thread.daemon]
     print(config.arch == ti.cpu, config.debug, config.cpu_max_num_threads, config.fast_math)
 """
 
 
-def test_starts_once_on_the_cpu_by_the_environment_and_says_nothing():
-    """The four words are all that the process prints: a greeting would spoil a user's pipe."""
-    assert run(STATE, TK_THREADS="1", TK_DEBUG="1") == ["True", "True", "1", "False"]
-
-
-def test_starting_asks_no_server():
-    code = """
-        import threading, urllib.request
-        urllib.request.urlopen = lambda *_, **__: print("asked")
-        from tk.kernels.runtime import ensure_runtime
-        ensure_runtime()
-        [thread.join(5) for thread in threading.enumerate() if thread.daemon]
-    """
-    assert run(code) == []
+def test_starts_once_on_the_cpu_by_the_environment_asks_no_server_and_says_nothing():
+    """Importing starts nothing. The words are all that the process prints: a greeting would spoil a user's pipe."""
+    assert run(STATE, TK_THREADS="1", TK_DEBUG="1") == ["True", "True", "True", "1", "False"]
 
 
 def test_leaves_the_callers_runtime_alone():
@@ -94,20 +88,12 @@ def test_a_cache_that_is_named_is_used(tmp_path):
     assert folder.startswith(str(tmp_path))
 
 
-@pytest.mark.parametrize(("age_s", "stays"), [(3600, False), (1, True)])
-def test_a_killed_process_does_not_switch_the_cache_off_for_good(tmp_path, age_s, stays):
+@pytest.mark.parametrize(("age_s", "stays", "is_compiled"), [(3600, False, False), (1, True, True)])
+def test_a_killed_process_does_not_switch_the_cache_off_for_good(tmp_path, age_s, stays, is_compiled):
+    """Compiling is announced only if nothing is compiled yet."""
     lock = tmp_path / "ticache.lock"
     lock.touch()
     os.utime(lock, (lock.stat().st_mtime - age_s,) * 2)
-    run(
-        "from tk.kernels.runtime import _break_stale_lock; _break_stale_lock()",
-        TI_OFFLINE_CACHE_FILE_PATH=str(tmp_path),
-    )
-    assert lock.exists() == stays
-
-
-@pytest.mark.parametrize("is_compiled", [False, True])
-def test_compiling_is_announced_only_if_nothing_is_compiled_yet(tmp_path, is_compiled):
     if is_compiled:
         (tmp_path / "T1.tic").touch()
     code = """
@@ -117,6 +103,7 @@ def test_compiling_is_announced_only_if_nothing_is_compiled_yet(tmp_path, is_com
         ensure_runtime()
     """
     words = run(code, TI_OFFLINE_CACHE_FILE_PATH=str(tmp_path))
+    assert lock.exists() == stays
     assert words[:3] == ["starting", "the", "kernels" if is_compiled else "kernels;"]
     assert ("compiling" in words) != is_compiled
 
@@ -160,12 +147,6 @@ def test_nan_and_infinity_keep_their_meaning():
     found = np.zeros(2, np.int32)
     _count_odd(np.array([1, np.nan, np.inf, np.nan, -np.inf], np.float32), found)
     np.testing.assert_array_equal(found, [2, 1])
-
-
-@pytest.mark.parametrize("module", ["tk.kernels.objective", "tk.model.cues.objective", "tk.model.body.initial_pose"])
-def test_importing_starts_nothing(module):
-    code = f"import {module}; from tk.kernels.runtime import ti; print(ti.lang.impl.get_runtime().prog is None)"
-    assert run(code) == ["True"]
 
 
 @ti.kernel

@@ -63,7 +63,7 @@ def other_values(old: np.ndarray) -> dict[str, Any]:
     return values
 
 
-@settings(max_examples=30, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_damaged_datasets_give_one_line(complete: Path, tmp_path: Path, data: st.DataObject) -> None:
     path = Path(shutil.copy(complete, tmp_path / "damaged.h5"))

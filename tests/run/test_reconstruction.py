@@ -4,7 +4,6 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-import open3d
 import pytest
 
 from tests.conftest import FRAMES, QUICK, Silent, Tk
@@ -37,6 +36,8 @@ def test_reconstructed_hull_equals_the_trackers(tk: Tk, tiny: Path, tmp_path: Pa
 
 
 def test_ply_files_hold_the_same_points(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+    import open3d  # takes seconds, which each worker that collects the tests would need
+
     hull, folder = tmp_path / "h.h5", tmp_path / "ply" / "deeper"
     ran = tk("reconstruct", tiny, "-o", hull, "--ply", folder, "--config", quick, "--frames", "5:7")
     assert ran.code == 0, ran.err
@@ -52,6 +53,8 @@ def test_ply_files_hold_the_same_points(tk: Tk, quick: Path, tiny: Path, tmp_pat
 
 
 def test_frames_without_anybody_are_empty(tk: Tk, quick: Path, copy: Path, tmp_path: Path) -> None:
+    import open3d
+
     for camera in (copy / "masks").iterdir():
         write_picture(camera / "000001.png", np.zeros((120, 160), np.uint8))
     ply = tmp_path / "ply"
@@ -96,6 +99,8 @@ def test_ply_files_that_cannot_be_written(tk: Tk, quick: Path, tiny: Path, tmp_p
 
 
 def test_meshes_are_closed_and_lie_where_the_voxels_do(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+    import open3d
+
     hull, folder = tmp_path / "h.h5", tmp_path / "mesh"
     ran = tk("reconstruct", tiny, "-o", hull, "--mesh", folder, "--config", quick, "--frames", "5:7")
     assert ran.code == 0, ran.err

@@ -81,6 +81,7 @@ def test_benchmark_of_a_small_capture_runs(
         assert text in printed
 
 
+@pytest.mark.slow
 def test_the_silhouette_tracker_has_stages_of_its_own(
     tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

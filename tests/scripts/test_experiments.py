@@ -108,28 +108,27 @@ SHORT = replace(settings_file.from_toml(QUICK), voxels=48)
 
 
 @pytest.fixture(scope="module")
-def tracked() -> Track:
-    """Three frames of the demo."""
-    return common.track(DEMO, SHORT, 3)
+def short(tiny: Path) -> Track:
+    return common.track(tiny, SHORT, 3)
 
 
-def test_a_capture_is_tracked_by_levenberg_marquardt(tracked: Track) -> None:
+def test_a_capture_is_tracked_by_levenberg_marquardt(tiny: Path, short: Track) -> None:
     with instead_of_smd():
-        track = common.track(DEMO, SHORT, 3)
-    assert 0.5 < track.mean_cm < 15 and track.mean_cm != tracked.mean_cm
-    assert (track.iterations > 0).all() and track.iterations.shape == tracked.iterations.shape
+        track = common.track(tiny, SHORT, 3)
+    assert 0.5 < track.mean_cm < 15 and track.mean_cm != short.mean_cm
+    assert (track.iterations > 0).all() and track.iterations.shape == short.iterations.shape
 
 
-def test_tracking_result_matches_the_capture(tracked: Track) -> None:
-    assert tracked.error_cm.shape == (3, len(JOINTS)) and tracked.pose.shape[0] == 3
-    assert 0.5 < tracked.mean_cm < 15 and tracked.lost_frames <= 3
-    assert (tracked.optimise_ms > 0).all() and (tracked.iterations > 0).all()
+def test_tracking_result_matches_the_capture(short: Track) -> None:
+    assert short.error_cm.shape == (3, len(JOINTS)) and short.pose.shape[0] == 3
+    assert 0.5 < short.mean_cm < 15 and short.lost_frames <= 3
+    assert (short.optimise_ms > 0).all() and (short.iterations > 0).all()
 
 
 @pytest.fixture(scope="module")
-def scene() -> sampling.Scene:
-    """The demo's second frame, tracked to."""
-    return sampling.look(Options(DEMO, 2, 1, Path("none.png")), settings_file.preset("kehl2006"))
+def scene(tiny: Path) -> sampling.Scene:
+    """The second frame, tracked to."""
+    return sampling.look(Options(tiny, 2, 1, Path("none.png")), settings_file.preset("kehl2006"))
 
 
 def test_recovery_of_a_displaced_arm_is_judged(

@@ -108,7 +108,7 @@ def test_feet_stand_on_the_floor_and_do_not_slide(plan: Plan) -> None:
     assert np.median(slide[planted]) < 0.01
 
 
-@pytest.mark.parametrize("name", ["demo", "object", "turn"])
+@pytest.mark.parametrize("name", ["object", "turn"])
 def test_another_rate_shows_the_same_motion_at_the_same_times(name: str) -> None:
     motion = MOTIONS[name](make_skeleton(1.75))
     faster = motion.at_rate(4 * motion.fps)
@@ -199,16 +199,13 @@ def test_crouch_goes_over_one_knee_to_the_heels_and_up_again() -> None:
     assert np.flatnonzero(squat)[0] < np.flatnonzero(kneels.any(axis=1))[0] < np.flatnonzero(sits)[0]
 
 
-@pytest.mark.parametrize("name", ["turn", "crouch"])
-def test_legs_reach_their_steps_at_every_stature(name: str) -> None:
-    for stature in (1.5, 2.0):
-        plan = plan_capture(Options(motion=name, size=(80, 60), stature_m=stature))
-        lowest = sole_points(plan.subject.skeleton, plan.subject.poses)[..., 2].min(axis=(1, 2))
-        assert np.abs(lowest).max() < 1e-3
-        knees = [
-            plan.subject.poses.origin[:, plan.subject.skeleton.index("knee" + side), 2].min() for side in ("_l", "_r")
-        ]
-        assert min(knees) > KNEE_RADIUS * stature - 0.004
+@pytest.mark.parametrize(("name", "stature"), [("turn", 2.0), ("crouch", 1.5)])
+def test_legs_reach_their_steps_at_every_stature(name: str, stature: float) -> None:
+    plan = plan_capture(Options(motion=name, size=(80, 60), stature_m=stature))
+    lowest = sole_points(plan.subject.skeleton, plan.subject.poses)[..., 2].min(axis=(1, 2))
+    assert np.abs(lowest).max() < 1e-3
+    knees = [plan.subject.skeleton.index("knee" + side) for side in ("_l", "_r")]
+    assert plan.subject.poses.origin[:, knees, 2].min() > KNEE_RADIUS * stature - 0.004
 
 
 def oracle_distance(actor_body: Body, pose: Any, points: np.ndarray) -> np.ndarray:
@@ -251,8 +248,8 @@ def test_traced_beams_find_the_same_body_as_dense_samples_of_each_ray(tiny: Plan
     camera, body, pose = tiny.rig[0], tiny.subject.body(0), tiny.subject.poses[:1]
     rays = sample_rays(camera, OFFSETS)
     still = Pose(pose.rotation.repeat(4, axis=0), pose.origin.repeat(4, axis=0))
-    found = render_actor(camera, rays, body, still, tiny.lamps, tiny.shadow(0))[::2, ::2, 3]
-    rays = rays[:, ::2, ::2]  # every second row and column, to save time
+    found = render_actor(camera, rays, body, still, tiny.lamps, tiny.shadow(0))[::4, ::4, 3]
+    rays = rays[:, ::4, ::4]  # every fourth row and column, to save time
     clear = np.full(rays.shape[:3], np.inf)
     for depth in np.linalg.norm(pose.origin[0, 0] - camera.center) + np.arange(-1.0, 1.0, 0.02):
         points = camera.center + depth * rays.reshape(-1, 3)

@@ -51,7 +51,8 @@ def test_bystander_scene_is_tracked_and_compared(
         (scene / name).symlink_to(tiny)
     config = tmp_path / "fitted.toml"
     config.write_text(FITTED, encoding="utf-8")
-    main([str(tmp_path / "scenes"), "--work", str(tmp_path / "work"), "--config", str(config), "--frames", "0:5"])
+    options = ["--config", str(config), "--frames", "0:2", "--causal", "--no-report"]
+    main([str(tmp_path / "scenes"), "--work", str(tmp_path / "work"), *options])
     name, limbs, without, difference, *_, missed, missed_without = capsys.readouterr().out.splitlines()[-1].split()
     assert name == "still"
     assert 0 < float(limbs) < 10

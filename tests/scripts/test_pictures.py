@@ -13,6 +13,7 @@ from scripts.browser import find_browser
 from tests.report.conftest import complete_result
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_browser() is None, reason="no Chromium is installed (Debian's package: chromium)")
 def test_images_of_the_docs_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     result = complete_result(tmp_path / "demo.h5", screenshots.DEMO, max(screenshots.FRAMES) + 1)

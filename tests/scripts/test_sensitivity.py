@@ -101,7 +101,7 @@ def test_tiny_capture_is_tracked_with_each_value(
 
     def here(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
         assert command[1:4] == ["-m", "scripts.sensitivity", "--track"]
-        tk(command[4:], standalone_mode=False)
+        tk([*command[4:], "--causal"], standalone_mode=False)
         return subprocess.CompletedProcess(command, 0)
 
     monkeypatch.setattr(subprocess, "run", here)

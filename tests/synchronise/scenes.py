@@ -56,7 +56,11 @@ def watch(camera: Camera, paths: list[Point], start_s: float, length_s: float, f
         for k, ((x, y), z) in enumerate(zip(pixels, depth, strict=True)):
             if not np.isfinite([x, y]).all():
                 continue
-            inside = 1 / (1 + np.exp(np.clip(2 * (np.hypot(_X - x, _Y - y) - 130 * 0.12 / z), -50, 50)))
-            images[k] += inside * (190 - images[k])
+            radius = 130 * 0.12 / z
+            near = tuple(  # beyond, the ball adds nothing
+                slice(max(int(at - radius) - 12, 0), max(int(at + radius) + 13, 0)) for at in (y, x)
+            )
+            inside = 1 / (1 + np.exp(np.clip(2 * (np.hypot(_X[near] - x, _Y[near] - y) - radius), -50, 50)))
+            images[k][near] += inside * (190 - images[k][near])
     images += random.normal(0, 1.0, images.shape)
     return Look(own, np.clip(images, 0, 255).astype(np.uint8))

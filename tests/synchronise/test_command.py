@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Callable
 from fractions import Fraction
+from functools import cache
 from pathlib import Path
 
 import av
@@ -49,6 +50,7 @@ def write(path: Path, look: Look, sound: NDArray[np.float64] | None = None, time
             container.mux(audio.encode())
 
 
+@cache
 def seen(c: int, start_s: float = 0.0, length_s: float = LENGTH_S) -> Look:
     return watch(ring(3)[c], [wander(0), wander(1)], STARTS[c] + start_s, length_s, (25.0, 25.0, 20.0)[c], seed=c)
 

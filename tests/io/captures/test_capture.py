@@ -386,11 +386,11 @@ def test_cameras_on_their_side_leave_the_default_up(make_capture: MakeCapture) -
 @pytest.mark.parametrize(
     ("name", "cameras", "frames", "masks", "background"),
     [
-        ("walk", 5, 80, True, 25),
+        pytest.param("walk", 5, 80, True, 25, marks=pytest.mark.slow),
         ("dance", 5, 120, True, 25),
         ("punch", 5, 150, False, 25),
         ("treadmill-slow", 6, 340, True, None),
-        ("rig9", 9, 40, True, 18),
+        pytest.param("rig9", 9, 40, True, 18, marks=pytest.mark.slow),
         ("balance", 4, 100, False, 1),
     ],
 )
