@@ -89,6 +89,11 @@ def test_one_pair_that_errs_accuses_nobody() -> None:
     assert verdict(errors(5, c01=2.0)) == USED
 
 
+def test_two_cameras_contradict_each_other_if_no_poor_mask_explains_the_error() -> None:
+    assert verdict(errors(2, c01=(2.5, 0.1))) == USED
+    assert verdict(errors(2, c01=(2.5, -2.5))) == REFUSED
+
+
 def test_mask_that_misses_a_piece_in_all_pairs_is_used() -> None:
     assert verdict(errors(4, c01=(-3.0, 0.1), c02=(-3.0, 0.1), c03=(-3.0, 0.1))) == USED
 
@@ -140,6 +145,9 @@ def test_exchanged_videos_are_the_explanation_if_all_pairs_agree_then() -> None:
         return nats(errors(5)) if (a, b) == (1, 3) else nats(turned(5, 1, 3, a, b))
 
     assert verdict(turned(5, 1, 3), exchange=exchange) == Verdict((), (1, 3), True)
+    poor = nats(errors(5, c01=(-3.0, 0.1), c02=(-3.0, 0.1), c03=(-3.0, 0.1)))
+    found = verdict(turned(5, 1, 3), exchange=lambda a, b: poor if (a, b) == (1, 3) else None)
+    assert found.exchanged == (1, 3), "one of the masks is poor besides"
     assert verdict(errors(5), exchange=exchange) == USED
 
 

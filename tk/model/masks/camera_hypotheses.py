@@ -11,7 +11,7 @@ logarithms of these ratios are added:
   nothing, and a large one contradicts.
 - Landmarks. They confirm a camera whose mask misleads. Without them, such a camera is left out, as a wrong one.
 
-A majority of the cameras must be right. If less than half may be, the cameras are refused.
+A majority of the cameras must be right: the probability that less are speaks for refusing them all.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class PairNats(NamedTuple):
 
 
 class Explanation(NamedTuple):
-    """Good masks of some cameras; the likeliest states of the others; the logarithm of the probability, unscaled."""
+    """The cameras that are wrong, and the logarithm of the probability, up to a constant, nats."""
 
     wrong: tuple[int, ...]
     nats: float
@@ -123,7 +123,7 @@ def most_probable(
     for wrong, nats in found:
         total[wrong] = float(np.logaddexp(total.get(wrong, -np.inf), nats))
     refused = sum(comb(number, k) * WRONG**k for k in range((number + 1) // 2, number + 1)) if number > 1 else _NEVER
-    exchanged = _exchanged(pairs, confirmed, max(*total.values(), np.log(refused)), exchange)
+    exchanged = _exchanged(pairs, seen, confirmed, max(*total.values(), np.log(refused)), exchange)
     if exchanged is not None:
         return Verdict((), exchanged, True)
     whole = np.logaddexp.reduce([*total.values(), np.log(refused)])
@@ -137,20 +137,21 @@ def most_probable(
 def _explanations(
     pairs: PairNats, seen: Bool, landmarks: Float, known: Bool, outside: Callable[[Sequence[int]], Float]
 ) -> Iterator[Explanation]:
-    """Yield the explanations that may matter, with ever more cameras whose masks are not good, but a minority. Sets are
-    extended from as many of the likeliest ones as there are cameras, because there are too many sets."""
+    """Yield the explanations that may matter, with ever more cameras whose masks are not good, up to half of them. Sets
+    are extended from as many of the likeliest ones as there are cameras, because there are too many sets."""
     C, judged = len(seen), np.flatnonzero(seen).tolist()
     shares = cache(lambda good: np.nan_to_num(outside(sorted(good))))
     best, kept = -np.inf, [frozenset[int]()]
-    for size in range(max((len(judged) + 1) // 2, 1)):
+    for size in range(len(judged) // 2 + 1):
         if size:
             kept = list({others | {c} for others in kept for c in judged if c not in others})
-        bounds = {others: _explained(pairs, others, landmarks, known, lambda _: np.zeros(C)) for others in kept}
+        minority = 2 * size < len(judged)
+        bounds = {o: _explained(pairs, o, minority, landmarks, known, lambda _: np.zeros(C)) for o in kept}
         kept.sort(key=lambda others: (-bounds[others].nats, sorted(others)))
         for others in kept:
             if bounds[others].nats < best + np.log(WRONG):  # shares only lower it
                 break
-            explanation = bounds[others] = _explained(pairs, others, landmarks, known, shares)
+            explanation = bounds[others] = _explained(pairs, others, minority, landmarks, known, shares)
             best = max(best, explanation.nats)
             yield explanation
         kept = sorted(kept, key=lambda others: (-bounds[others].nats, sorted(others)))[:C]
@@ -159,11 +160,15 @@ def _explanations(
 def _explained(
     pairs: PairNats,
     others: frozenset[int],
+    minority: bool,
     landmarks: Float,
     known: Bool,
     outside: Callable[[frozenset[int]], Float],
 ) -> Explanation:
-    """Return the explanation in which the masks of some cameras are not good, and all other masks are."""
+    """Return the explanation in which the masks of some cameras are not good, and all other masks are.
+
+    Each of these masks is poor, or its camera is wrong. If they are no minority, no camera is wrong.
+    """
     C = len(landmarks)
     rest = frozenset(range(C)) - others
     good, shares = sorted(rest), outside(rest)
@@ -179,8 +184,8 @@ def _explained(
             right = np.logaddexp(right, _MISLEADING) + landmarks[c]
         else:
             apart = np.logaddexp(apart, _MISLEADING)
-        nats += np.logaddexp(right, apart)
-        if apart > right:
+        nats += np.logaddexp(right, apart) if minority else right
+        if minority and apart > right:
             wrong.append(c)
     return Explanation(tuple(wrong), float(nats))
 
@@ -192,19 +197,21 @@ def _nats(outside: Float | np.floating, mean: float) -> Float:
 
 
 def _exchanged(
-    pairs: PairNats, landmarks: Float, best: float, exchange: Callable[[int, int], PairNats | None]
+    pairs: PairNats, seen: Bool, landmarks: Float, best: float, exchange: Callable[[int, int], PairNats | None]
 ) -> tuple[int, int] | None:
     """Return the two cameras whose exchanged videos explain the masks better than ``best``, nats; None if no two do.
     Only cameras that contradict the others can be exchanged."""
-    C, result = len(landmarks), None
+    C, result = len(seen), None
     contradict = np.flatnonzero(pairs.good.sum(axis=1) < 0).tolist()
     for a, b in combinations(contradict, 2):
-        if (found := exchange(a, b)) is None:
+        found = exchange(a, b)
+        # one tested partner agrees by chance
+        if found is None or (found.good[[a, b]] != 0).sum(axis=1).min() < 2:
             continue
-        # landmarks that contradict those of the exchanged videos say nothing
-        rest = np.maximum(np.delete(landmarks, [a, b]), 0.0).sum()
-        nats = C * _RIGHT + np.log(WRONG) + rest + np.triu(found.good, 1).sum()
-        # one partner agrees by chance
-        if (found.good[[a, b]] != 0).sum(axis=1).min() > 1 and nats > best:
-            best, result = float(nats), (a, b)
+        # landmarks of exchanged videos contradict those of the others: they say nothing
+        said = np.where(np.isin(np.arange(C), (a, b)), 0.0, np.maximum(landmarks, 0.0))
+        explained = _explanations(found, seen, said, np.zeros(C, np.bool_), lambda _: np.zeros(C))
+        nats = float(np.log(WRONG) + np.logaddexp.reduce([e.nats for e in explained if not e.wrong]))
+        if nats > best:
+            best, result = nats, (a, b)
     return result
