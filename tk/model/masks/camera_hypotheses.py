@@ -38,12 +38,12 @@ WRONG, POOR = WRONG_HZ / END_HZ, POOR_HZ / (END_HZ + POOR_HZ)
 #: Error of correct masks and cameras: three standard deviations of a pair's error, as a share of the person's size,
 #: without a pixel of either mask; and the mean share of a mask outside the hull of the others.
 ERROR = 0.015
-#: Mean size of a piece that a poor mask misses or shows, as a share of the person's size or area.
+# Mean size of a piece that a poor mask of the opening misses or shows, as a share of the person's size or area.
 _PIECE = 0.05
 # Cameras are left out, or used, if the others are right with this probability; else all are refused.
 _CERTAIN = 0.9
 _NEVER = np.finfo(np.float64).tiny
-_RIGHT, _MISLEADING, _PIECES = np.log([1.0 - WRONG - POOR, POOR * MISLEADS, POOR * (1.0 - MISLEADS) / 2])
+_RIGHT, _MISLEADING = np.log1p(-WRONG - POOR), np.log(POOR * MISLEADS)
 
 
 class Verdict(NamedTuple):
@@ -179,7 +179,8 @@ def _explained(
         lost = outside(rest | {c})[good].mean()  # of the others' masks, if this one carves
         missing = pairs.missing[c, good].sum() + exact[c] + _nats(lost, _PIECE)
         surplus = pairs.surplus[c, good].sum() + pieces[c] + _nats(lost, ERROR)
-        right, apart = _PIECES + np.logaddexp(missing, surplus), np.log(WRONG)
+        right = np.log(POOR * (1.0 - MISLEADS) / 2) + np.logaddexp(missing, surplus)
+        apart = np.log(WRONG)
         if known[c]:
             right = np.logaddexp(right, _MISLEADING) + landmarks[c]
         else:
