@@ -16,8 +16,7 @@ A majority of the cameras must be right: the probability that less are speaks fo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import cache
+from collections.abc import Callable, Iterator
 from itertools import combinations
 from math import comb
 from typing import NamedTuple
@@ -98,7 +97,7 @@ def most_probable(
     pairs: PairNats,
     seen: Bool,
     landmarks: Float,
-    outside: Callable[[Sequence[int]], Float],
+    outside: Callable[[tuple[int, ...]], Float],
     exchange: Callable[[int, int], PairNats | None],
 ) -> Verdict:
     """Return the verdict on C cameras.
@@ -135,12 +134,11 @@ def most_probable(
 
 
 def _explanations(
-    pairs: PairNats, seen: Bool, landmarks: Float, known: Bool, outside: Callable[[Sequence[int]], Float]
+    pairs: PairNats, seen: Bool, landmarks: Float, known: Bool, outside: Callable[[tuple[int, ...]], Float]
 ) -> Iterator[Explanation]:
     """Yield the explanations that may matter, with ever more cameras whose masks are not good, up to half of them. Sets
     are extended from as many of the likeliest ones as there are cameras, because there are too many sets."""
     C, judged = len(seen), np.flatnonzero(seen).tolist()
-    shares = cache(lambda good: np.nan_to_num(outside(sorted(good))))
     best, kept = -np.inf, [frozenset[int]()]
     for size in range(len(judged) // 2 + 1):
         if size:
@@ -151,7 +149,9 @@ def _explanations(
         for others in kept:
             if bounds[others].nats < best + np.log(WRONG):  # shares only lower it
                 break
-            explanation = bounds[others] = _explained(pairs, others, minority, landmarks, known, shares)
+            explanation = bounds[others] = _explained(
+                pairs, others, minority, landmarks, known, lambda good: np.nan_to_num(outside(tuple(sorted(good))))
+            )
             best = max(best, explanation.nats)
             yield explanation
         kept = sorted(kept, key=lambda others: (-bounds[others].nats, sorted(others)))[:C]

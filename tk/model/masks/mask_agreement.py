@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -156,11 +157,12 @@ class MaskAgreement:
         seen = [self.small(masks) for masks in frames]
         hulls = self.hulls([self.possible(masks) for masks in frames], there)
         views = [(masks, hull) for masks, hull in zip(seen, hulls, strict=True) if hull is not None]
+        outside = cache(lambda cameras: self._outside(views, cameras))
         verdict = most_probable(
             PairNats.of(pairs.error, _tolerance(pairs)),
             np.isfinite(pairs.pixel),
             np.full(C, np.nan) if landmarks is None else landmarks,
-            lambda right: self._outside(views, right),
+            outside,
             lambda a, b: self._exchanged(frames, outlines, a, b),
         )
         wrong, right = verdict.wrong, [c for c in range(C) if c not in verdict.wrong]
@@ -183,7 +185,7 @@ class MaskAgreement:
             tangency=pairs,
             wrong=wrong,
             refusal=refusal,
-            outside=self._outside(views, right),
+            outside=outside(tuple(right)),
             shift_px=shift,
             closes=np.array([hull is not None and hull.carve(range(C)).any() for hull in hulls], bool),
             extent_m=float(np.median(extents)) if extents else np.nan,
