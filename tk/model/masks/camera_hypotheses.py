@@ -136,21 +136,20 @@ def most_probable(
 def _explanations(
     pairs: PairNats, seen: Bool, landmarks: Float, known: Bool, outside: Callable[[tuple[int, ...]], Float]
 ) -> Iterator[Explanation]:
-    """Yield the explanations that may matter, with ever more cameras whose masks are not good, up to half of them. Sets
+    """Yield the explanations that may matter, with ever more cameras whose masks are not good, but a minority. Sets
     are extended from as many of the likeliest ones as there are cameras, because there are too many sets."""
     C, judged = len(seen), np.flatnonzero(seen).tolist()
     best, kept = -np.inf, [frozenset[int]()]
-    for size in range(len(judged) // 2 + 1):
+    for size in range(max((len(judged) + 1) // 2, 1)):
         if size:
             kept = list({others | {c} for others in kept for c in judged if c not in others})
-        minority = 2 * size < len(judged)
-        bounds = {o: _explained(pairs, o, minority, landmarks, known, lambda _: np.zeros(C)) for o in kept}
+        bounds = {o: _explained(pairs, o, landmarks, known, lambda _: np.zeros(C)) for o in kept}
         kept.sort(key=lambda others: (-bounds[others].nats, sorted(others)))
         for others in kept:
             if bounds[others].nats < best + np.log(WRONG):  # shares only lower it
                 break
             explanation = bounds[others] = _explained(
-                pairs, others, minority, landmarks, known, lambda good: np.nan_to_num(outside(tuple(sorted(good))))
+                pairs, others, landmarks, known, lambda good: np.nan_to_num(outside(tuple(sorted(good))))
             )
             best = max(best, explanation.nats)
             yield explanation
@@ -160,14 +159,13 @@ def _explanations(
 def _explained(
     pairs: PairNats,
     others: frozenset[int],
-    minority: bool,
     landmarks: Float,
     known: Bool,
     outside: Callable[[frozenset[int]], Float],
 ) -> Explanation:
     """Return the explanation in which the masks of some cameras are not good, and all other masks are.
 
-    Each of these masks is poor, or its camera is wrong. If they are no minority, no camera is wrong.
+    Each of these masks is poor, or its camera is wrong.
     """
     C = len(landmarks)
     rest = frozenset(range(C)) - others
@@ -185,8 +183,8 @@ def _explained(
             right = np.logaddexp(right, _MISLEADING) + landmarks[c]
         else:
             apart = np.logaddexp(apart, _MISLEADING)
-        nats += np.logaddexp(right, apart) if minority else right
-        if minority and apart > right:
+        nats += np.logaddexp(right, apart)
+        if apart > right:
             wrong.append(c)
     return Explanation(tuple(wrong), float(nats))
 
