@@ -291,7 +291,7 @@ class SecondPass:
                 if i != last + step:
                     continue
                 present, poses = self.poses[i], begun[:, n]
-                if (tracked := np.flatnonzero(np.isfinite(known))).size:
+                if tracked := np.flatnonzero(np.isfinite(known)).tolist():
                     some = [alternatives[k] for k in tracked]
                     starts = np.repeat(present[None, None], len(some), axis=0)
                     for start, k, one in zip(starts[:, 0], tracked, some, strict=True):

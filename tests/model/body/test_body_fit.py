@@ -12,6 +12,7 @@ from tests.model.ring import ring_of_cameras
 from tk.kernels.cones import CONE
 from tk.kernels.line_search import SearchSettings
 from tk.kernels.silhouette import Edgels
+from tk.model.body import body_fit
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_fit import fit_body
 from tk.model.body.body_parameters import BodyFamily, shape_rows
