@@ -278,7 +278,7 @@ class SecondPass:
         """
         order, result = self.tracked[::step], np.repeat(self.poses[None], len(alternatives), axis=0)
         cost, mean = np.zeros(result.shape[:2]), np.full(len(alternatives), np.nan)  # NaN: none is tracked
-        moves = np.array([one.goes_on for one in alternatives])  # whether its last step was motion, and no jump
+        pasts: list[Float | None] = [None] * len(alternatives)  # (D,) their poses in the frame before the last
         for begin in range(0, len(order) - 1, AT_ONCE):
             frames = order[begin + 1 : begin + 1 + AT_ONCE]
             lasts, seen = order[begin : begin + len(frames)], cache(lambda i: self._pyramid(i, LEVEL + 1))
@@ -295,10 +295,10 @@ class SecondPass:
                     some = [alternatives[k] for k in tracked]
                     starts = np.repeat(present[None, None], len(some), axis=0)
                     for start, k, one in zip(starts[:, 0], tracked, some, strict=True):
-                        predicted = self._predicted(result[k], last, step) if moves[k] else result[k, last]
-                        start[one.dofs] = predicted[one.dofs]
+                        start[one.dofs] = _predicted(result[k, last], pasts[k])[one.dofs]
                     poses[tracked] = self._settled(some, starts, frames[n : n + 1], seen)[:, 0]
-                moves = np.array([one.goes_on for one in alternatives]) | np.isfinite(known)
+                goes_on = np.isfinite(known).tolist()
+                pasts = [self._past(*one, last) for one in zip(alternatives, result, goes_on, strict=True)]
                 differ = np.flatnonzero((poses != present).any(axis=1))
                 if not len(differ):
                     continue
@@ -316,7 +316,7 @@ class SecondPass:
 
     def _starts(self, one: Alternative, lasts: NDArray[np.int64], frames: NDArray[np.int64], step: int) -> Float:
         """Return the poses (N, D) from which an alternative begins in N frames; the present one where it does not."""
-        poses, every, follows = self.poses[frames], self.tracker.search_frames, frames == lasts + step
+        poses, follows = self.poses[frames], frames == lasts + step
         if one.mode is not None:
             assert self._modes is not None
             angles = self._modes[frames, one.mode][:, one.dofs]
@@ -324,18 +324,19 @@ class SecondPass:
             poses[np.ix_(known, one.dofs)] = angles[known]
         elif one.goes_on:
             for n in np.flatnonzero(follows).tolist():
-                poses[n, one.dofs] = self._predicted(self.poses, lasts[n], step)[one.dofs]
-        elif every:
-            for n in np.flatnonzero(follows & (frames % every == 0)).tolist():
+                past = self.poses[lasts[n] - step] if lasts[n] - step in self._seen else None
+                poses[n, one.dofs] = _predicted(self.poses[lasts[n]], past)[one.dofs]
+        else:
+            for n in np.flatnonzero(follows).tolist():
                 poses[n] = exchanged(poses[n], [one.legs])[0]
         return poses
 
-    def _predicted(self, poses: Float, last: int, step: int) -> Float:
-        """Return the pose (D,) that poses (F, D) until frame ``last`` predict for the next one."""
-        before = last - step
-        moves = 0 <= before < len(poses) and before in self._seen
-        velocity = poses[last] - poses[before] if moves else 0.0
-        return np.asarray(poses[last] + VELOCITY * velocity)
+    def _past(self, one: Alternative, poses: Float, tracked: bool, frame: int) -> Float | None:
+        """Return the pose (D,) in a frame of an alternative with poses (F, D), which was tracked there or begins in the
+        next frame; None if it is unknown."""
+        if tracked or one.goes_on:
+            return np.asarray(poses[frame])
+        return exchanged(self.poses[frame], [one.legs])[0] if one.legs else None
 
     def _settled(
         self,
@@ -375,6 +376,11 @@ class SecondPass:
         if not used.all():
             shown = np.where(used[:, None, None], shown, np.uint8(0))
         return self.tracker.views.pyramid(shown, scales, False, in_frames(self._measured, i, used))
+
+
+def _predicted(pose: Float, past: Float | None) -> Float:
+    """Return the pose (D,) after a pose (D,) and the one before it; no motion if that is unknown."""
+    return pose if past is None else np.asarray(pose + VELOCITY * (pose - past))
 
 
 def _surprises(joints: Float, frames: NDArray[np.int64]) -> Float:
