@@ -29,8 +29,7 @@ RATE = 0.6
 # follows noise. With 0.03 and 0.06 the mean errors of five captures (60 frames, three seeds) change by 0.02 cm at most.
 LEVER_M = 0.045
 # Maximum change in one iteration: a draw of samples with little evidence on a parameter yields longer steps, and
-# without a bound SMD diverges in some frame of five captures. At 15 Hz a joint turns by up to 31° between frames (7.4),
-# two steps. With half and twice the values the mean errors of walk and dance (45 frames) change by 0.01 cm at most.
+# without a bound SMD diverges. At 15 Hz a joint turns by up to 31° between frames (7.4), two steps.
 MAX_STEP_DEG, MAX_STEP_M = 20.0, 0.15
 
 

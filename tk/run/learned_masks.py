@@ -45,8 +45,7 @@ _Asked: TypeAlias = "tuple[int, Segmented]"
 LEARNED, LEARNED_AND_SEGMENTER, SEGMENTER = range(3)
 MASK_SOURCES = ("learned scene", "learned scene and segmenter", "segmenter")
 
-# Seconds of a span, between asked frames, and least number of asked frames of a span. More often: dance, where the
-# trunk hardly moves, has masks with 2 to 5 % less surplus area at 0.5 s than at 0.67 s; walk has the same at 1 s.
+# Seconds of a span, between asked frames, and least number of asked frames of a span.
 _SPAN_S, _STEP_S, _LEAST = 10.0, 0.5, 8
 # Asked frames that a source of unknown length is learned from, and how many come between two times of learning.
 _PAST, _EVERY = 16, 4
@@ -54,8 +53,7 @@ _PAST, _EVERY = 16, 4
 _SHARE = 0.16
 # Most bytes of a span's samples. With fewer samples, more of the scene is unknown.
 _SAMPLE_BYTES = 512_000_000
-# Masks disagree if more than this share of the pixels in either is in only one of them. The share is 0.05 to 0.2 on
-# walk and dance; in a camera above, 0.3 to 0.6 on walk, where the segmenter, not the scene, misses the head.
+# Masks disagree if more than this share of the pixels in either is in only one of them.
 _DISAGREE = 0.65
 
 

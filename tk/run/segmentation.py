@@ -39,14 +39,11 @@ Labeller = Callable[[FrameSet], Labels]
 # what :func:`mask_source` returns; "none": no masks are given, they are made from the empty scene
 _GIVEN, _SCENE, _MEDIAN, _SEGMENTER = "given", "none", "median", "segmenter "
 
-# Frames of the median background. With 12, 25, 50 and 100, limbs of walk have errors of 0.8, 0.9, 0.7 and 0.7 cm. With
-# 25 no note says that the median shows parts of the dancer (limbs 5.1 cm), with 50 and 100 one does (2.4 and 1.9 cm).
+# Frames of the median background.
 PLATE_FRAMES = 50
 
 # The median is the empty scene where the person covers a pixel in less than half of the frames. A pixel that is covered
-# in more than _LONG of the frames is in danger; a note says so if these pixels exceed _MANY of the person's area
-# (measured: 0.35 to 0.51 on a walk, where the median is as good as a clip; 0.76 to 1.2 on a dance and a treadmill,
-# where it is not).
+# in more than _LONG of the frames is in danger; a note says so if these pixels exceed _MANY of the person's area.
 _LONG, _MANY = 0.4, 0.6
 # litres, least volume of a person's visual hull; with cameras on four sides the hull is twice as large as the person
 _LEAST_LITRES = 40.0

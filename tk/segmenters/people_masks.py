@@ -54,8 +54,7 @@ _BALL_MARGIN, _HULL_MARGIN = 1.25, 1.35
 #: a mask that covers a smaller share of the others' hull shows another person. The hull is up to twice as large as the
 #: person; correct masks cover 0.4 and more (measured).
 _LEAST_SHARE = 0.3
-#: pixels with a probability from here to 0.5 are uncertain. Half and twice the value change the mean errors of walk and
-#: dance without an empty scene (60 frames) by 0.01 cm at most; so do the next number and the share of a speck.
+#: pixels with a probability from here to 0.5 are uncertain
 _UNCERTAIN = 0.1
 #: a square larger than the hull's by this factor wastes the network's pixels
 _TOO_LARGE = 1.6
