@@ -69,16 +69,21 @@ def image_faults(frames: Sequence[Frame]) -> NDArray[np.bool_]:
 
 
 def opening_agreement(setup: Setup, frames: Sequence[Frame], bad: NDArray[np.bool_]) -> Agreement:
-    """Return whether the silhouettes and landmarks of the opening frames agree. ``bad``: (F, C) images that are not
-    compared."""
+    """Return whether the silhouettes of the opening frames agree.
+
+    A network's masks have holes and contain pieces of other things. A camera whose masks contradict the others is right
+    if its landmarks agree with the others'. ``bad``: (F, C) images that are not compared.
+    """
     rows = spread_over(range(len(frames)))
+    found = MaskAgreement(setup.rig, setup.volume).compare([frames[i].masks for i in rows], ~bad[rows])
     seen = [
         np.where(wrong[:, None, None], np.nan, frame.landmarks)
         for frame, wrong in zip(frames, bad, strict=True)
         if frame.landmarks is not None
     ]
-    landmarks = evidence_for_cameras(setup.rig, seen) if seen else None
-    return MaskAgreement(setup.rig, setup.volume).compare([frames[i].masks for i in rows], ~bad[rows], landmarks)
+    if not seen or not (found.wrong or found.refusal):
+        return found
+    return found.confirmed(evidence_for_cameras(setup.rig, seen))
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,6 @@ from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import determine_depth
 from tk.model.cues.part_colors import RATE
-from tk.model.masks.camera_hypotheses import END_HZ, MISLEADS, POOR, POOR_HZ, WRONG_HZ
 from tk.model.masks.image_health import IMAGE_FAULTS
 from tk.model.stateful import Stateful
 from tk.trackers.protocol import Estimate, Tracker, sharing
@@ -77,10 +76,13 @@ _CERTAIN = np.array([False, *(fault.certain for fault in FAULTS.values())])
 #: meaning of each value of `/evidence/camera`
 STATE_MEANINGS = ("0: used", *(f"{value}: {fault.text}" for value, fault in enumerate(FAULTS.values(), 1)))
 
+# A camera becomes wrong once in eleven minutes, a mask poor once in half a minute; both last five seconds. These rates
+# are assumed, and so are the shares below.
+_BEGIN_HZ, _END_HZ, _POOR_HZ = 0.0015, 0.2, 0.03
 # Wrong poses a second, whatever the cameras are.
 _LOSE_HZ = 0.3
-# Mean size of a piece that a poor mask misses or shows, as a share of the person's pixels.
-_PIECE = 0.15
+# Share of the frames with a poor mask in which it misleads. Mean size of a piece, as a share of the person's pixels.
+_TORN, _PIECE = 0.05, 0.15
 
 
 def likelihoods(excess: Float, spread: Float) -> Float:
@@ -116,8 +118,8 @@ class Cameras(Stateful[Belief]):
         self._probability = np.zeros((count, 1 + len(STATES)))
         self._probability[:, 0] = 1.0
         self._fps = fps
-        begin, poor, end = WRONG_HZ / fps, min(POOR_HZ / fps, 0.5), min(END_HZ / fps, 0.5)
-        after = end * POOR  # the mask of a camera that was wrong may be poor
+        begin, poor, end = _BEGIN_HZ / fps, min(_POOR_HZ / fps, 0.5), min(_END_HZ / fps, 0.5)
+        after = end * _POOR_HZ / (_END_HZ + _POOR_HZ)  # the mask of a camera that was wrong may be poor
         self._transition = np.array([
             [1 - poor - begin, poor, begin],
             [end, 1 - end - begin, begin],
@@ -164,7 +166,7 @@ class Cameras(Stateful[Belief]):
             best: (C, 3) of residuals without an excess.
         """
         right, poor, wrong = (self._expected() + likelihood).T
-        odds = np.logaddexp(poor + np.log(MISLEADS), wrong) - np.logaddexp(right, poor + np.log1p(-MISLEADS))
+        odds = np.logaddexp(poor + np.log(_TORN), wrong) - np.logaddexp(right, poor + np.log1p(-_TORN))
         doubtful = kept & (likelihood[:, 1:].max(axis=1) > likelihood[:, 0])
         camera = int(np.argmax(np.where(doubtful, odds, -np.inf)))
         others = kept & (np.arange(len(kept)) != camera)
@@ -186,9 +188,9 @@ class Cameras(Stateful[Belief]):
                     right + with_it[camera, 0] + all_used,
                     np.log(_LOSE_HZ / self._fps) + with_it[camera, 2] + with_it[others, 2].sum(),
                 ),
-                poor + np.log1p(-MISLEADS) + with_it[camera, 1] + all_used,
+                poor + np.log1p(-_TORN) + with_it[camera, 1] + all_used,
                 wrong + without[camera, 2] + fewer,
-                poor + np.log(MISLEADS) + without[camera, 1] + fewer,
+                poor + np.log(_TORN) + without[camera, 1] + fewer,
             ])
         )  # fmt: skip
         self._probability[camera, :3] = probability[:3] + np.array([0.0, probability[3], 0.0])

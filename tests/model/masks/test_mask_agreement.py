@@ -20,7 +20,7 @@ from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume
-from tk.model.masks.mask_agreement import INCONSISTENT, Agreement, MaskAgreement, excess
+from tk.model.masks.mask_agreement import INCONSISTENT, Agreement, MaskAgreement, excess, largest_consistent
 from tk.model.masks.tangency import Tangency
 
 
@@ -156,6 +156,20 @@ def test_swapped_videos_are_named(masks: np.ndarray) -> None:
     assert found.wrong == () and found.refusal.startswith("the videos of c1 and c3 look swapped")
 
 
+@pytest.mark.parametrize(("facing", "expected"), [(False, (0, 1)), (True, None)])
+def test_swap_needs_two_tested_partners_of_each_camera(
+    monkeypatch: pytest.MonkeyPatch, facing: bool, expected: tuple[int, int] | None
+) -> None:
+    """Of three cameras, two of which face each other, exchanged videos agree by chance."""
+    error = np.zeros((3, 3, 2))
+    error[range(3), range(3)] = np.nan
+    if facing:
+        error[[0, 2], [2, 0]] = np.nan
+    exchanged = Tangency(error, np.full(3, 0.004), np.eye(3))
+    monkeypatch.setattr("tk.model.masks.mask_agreement.tangency", lambda *_: exchanged)
+    assert MaskAgreement(Rig(tuple(RIG)[:3]), VOLUME)._swapped([], [], [0, 1, 2]) == expected
+
+
 def test_two_cameras_that_contradict_each_other_are_refused(masks: np.ndarray) -> None:
     assert part(masks, [0, 1]).refusal == ""
     found = part(masks, [0, 1], turned(RIG, 1, 8.0))
@@ -194,8 +208,6 @@ def test_cameras_that_face_each_other_are_refused(masks: np.ndarray) -> None:
         "c0 and c9 see the person from the same or from" in compare(mirrored[:, [0, 2]], Rig((first, facing))).refusal
     )
     assert compare(mirrored, Rig((first, RIG[1], facing))).refusal == ""
-    two = MaskAgreement(Rig((first, facing)), VOLUME)
-    assert two.compare(list(mirrored[:, [0, 2]]), landmarks=np.full(2, 4.0)).refusal == "", "landmarks show depth"
 
 
 def test_silhouette_that_the_border_cuts_contradicts_nothing(masks: np.ndarray) -> None:
@@ -233,6 +245,14 @@ def test_shadow_in_the_masks_of_one_camera_excludes_nobody(masks: np.ndarray) ->
     assert found.wrong == () and found.refusal == ""
 
 
+def test_set_with_an_untested_rival_blames_nobody() -> None:
+    """0 and 2 face each other; of 0 and 1, which contradict each other, either may be wrong."""
+    error = np.array([[np.nan, 2.0, np.nan], [2.0, np.nan, 0.1], [np.nan, 0.1, np.nan]])
+    assert largest_consistent(error) == []
+    error[0, 2] = error[2, 0] = 3.0
+    assert largest_consistent(error) == [1, 2]
+
+
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [
@@ -266,33 +286,28 @@ def test_empty_mask_in_one_frame_is_ignored(masks: np.ndarray) -> None:
     assert found.closes.tolist() == [True, False, True] and found.wrong == ()
 
 
-def spoilt(masks: np.ndarray, *cameras: int) -> np.ndarray:
-    """Return masks in which some cameras show half of the person."""
-    return np.where((np.arange(240)[:, None] > 120) | ~np.isin(np.arange(5), cameras)[:, None, None], masks, 0)
+NO_EVIDENCE = np.full(5, np.nan)
 
 
-def test_landmarks_confirm_a_camera_whose_masks_mislead(masks: np.ndarray) -> None:
-    half, nobody = spoilt(masks, 2).astype(np.uint8), np.full(5, np.nan)
-    compare = MaskAgreement(RIG, VOLUME).compare
-    assert compare(list(half), landmarks=nobody).wrong == (2,)
-    assert compare(list(half), landmarks=np.full(5, 4.0)).wrong == ()
-    assert compare(list(half), landmarks=np.array([4.0, 4.0, -6.0, 4.0, 4.0])).wrong == (2,)
-    assert compare(list(half), landmarks=np.array([4.0, 4.0, np.nan, 4.0, 4.0])).wrong == (2,)
+def with_evidence(**nats: float) -> np.ndarray:
+    """Return (5,) evidence for the cameras c0 to c4; the others have none."""
+    return np.array([nats.get(f"c{c}", np.nan) for c in range(5)])
 
 
-def test_landmarks_confirm_two_cameras_whose_masks_contradict_each_other(masks: np.ndarray) -> None:
-    pair = MaskAgreement(Rig(tuple(turned(RIG, 1, 8.0))[:2]), VOLUME)
-    frames = list(masks[:, :2])
-    assert pair.compare(frames).refusal and pair.compare(frames, landmarks=np.full(2, np.nan)).refusal
-    assert pair.compare(frames, landmarks=np.full(2, 8.0)).refusal == ""
-    assert pair.compare(frames, landmarks=np.array([-8.0, -8.0])).refusal
+def test_camera_that_other_evidence_confirms_is_not_wrong(masks: np.ndarray) -> None:
+    judged = replace(compare(masks), wrong=(1, 3))
+    assert judged.confirmed(with_evidence(c0=4, c1=5, c2=4, c3=6, c4=3)).wrong == ()
+    assert judged.confirmed(with_evidence(c0=4, c1=5, c2=4, c3=-6, c4=3)).wrong == (3,)
+    assert judged.confirmed(with_evidence(c0=4, c1=5, c2=4)).wrong == (3,)  # of c3 the masks alone tell
+    assert judged.confirmed(NO_EVIDENCE).wrong == judged.wrong
 
 
-def test_two_poor_masks_of_three_are_used(masks: np.ndarray) -> None:
-    """Both lack the feet: each contradicts the third camera, and neither is turned."""
-    footless = masks.copy()
-    for mask in (m for c in (0, 2) for m in footless[:, c]):
-        mask[np.flatnonzero(mask.any(axis=1))[-20:]] = 0
-    found = part(footless, [0, 2, 3])
-    assert np.nanmax(excess(found.tangency)) > 1.0
-    assert found.wrong == () and found.refusal == ""
+def test_refusal_stays_unless_other_evidence_denies_it(masks: np.ndarray) -> None:
+    refused = replace(compare(masks), refusal="no three cameras agree")
+    assert refused.confirmed(np.full(5, 4.0)).refusal == ""
+    assert refused.confirmed(with_evidence(c0=4, c1=4, c2=4)).refusal == ""
+    assert refused.confirmed(with_evidence(c0=4, c1=4, c2=-4, c3=4, c4=4)).refusal == refused.refusal
+    assert refused.confirmed(NO_EVIDENCE).refusal == refused.refusal  # as with two cameras
+    one_sided = replace(refused, wrong=(2,))
+    assert one_sided.confirmed(with_evidence(c0=4, c1=4, c2=-4, c3=4, c4=4)).refusal == refused.refusal
+    assert one_sided.confirmed(np.full(5, 4.0)).refusal == ""

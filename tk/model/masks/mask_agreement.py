@@ -1,17 +1,17 @@
 """Whether the cameras and the silhouettes are consistent with one another, before anybody is tracked.
 
-Pairs of cameras are tested by epipolar tangency (:mod:`tk.model.masks.tangency`). What no pair shows, such as a second
-person beside the first in one view, the visual hull shows: a point of the person lies in every mask, so the hull of any
-cameras contains the person (Laurentini, 1994), and its silhouette in another camera covers that camera's mask. The most
-probable explanation of both decides (:mod:`tk.model.masks.camera_hypotheses`). `tk inspect` and the start of the
-tracking use the same test. The test of hulls is ours.
+Pairs of cameras are tested by epipolar tangency (:mod:`tk.model.masks.tangency`). The largest majority of cameras that
+agree with most of their partners is right; the others are wrong. What no pair shows, such as a second person beside the
+first in one view, the visual hull shows: a point of the person lies in every mask, so the hull of any cameras contains
+the person (Laurentini, 1994), and its silhouette in another camera covers that camera's mask. `tk inspect` and the
+start of the tracking use the same test. The tests of hulls and sets are ours.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from itertools import combinations
 
 import cv2
 import numpy as np
@@ -22,19 +22,27 @@ from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import LEAST_INFORMATION, depth_information
 from tk.model.cameras.volume import Volume, VoxelGrid
 from tk.model.hull.coarse import Hull, Voxels, dilated
-from tk.model.masks.camera_hypotheses import ERROR, WRONG, PairNats, most_probable
 from tk.model.masks.tangency import Outline, Tangency, tangency
 
 Float = NDArray[np.float64]
 Masks = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 
+# Error that two correct cameras may have, as a share of the person's size, plus one pixel of either mask.
+TOLERANCE = 0.012
 # Voxels along the working volume's longest side; those near the person are divided by two.
 _COARSE = 36
 # Rows of an image that are used for hulls, approximately.
 _ROWS = 120
-#: Share of the masks outside the hulls of the others that is less probable than a wrong camera.
-INCONSISTENT = -ERROR * float(np.log(WRONG))
+# Share of the masks outside the hulls of the others above which a camera is wrong: exact masks leave less than 1 %
+# outside, segmented ones 1 to 3 %.
+INCONSISTENT = 0.06
+# One camera is identified as wrong if the share outside falls to this fraction without it. If none is identified, the
+# cameras are refused above this many times INCONSISTENT.
+_LEFT_OVER, _REFUSED = 0.5, 2.0
+# Without a majority, exchanged videos are searched for among at most this many cameras: of more, without two of them,
+# the others are a majority.
+_SWAPS_OF = 8
 
 _CAUSES = (
     "a camera was turned or moved after the calibration, calibration.toml is of another recording, the videos do not "
@@ -70,6 +78,17 @@ class Agreement:
     extent_m: float
     reductions: tuple[int, ...]
 
+    def confirmed(self, evidence: Float) -> Agreement:
+        """Return the agreement without contradictions that other evidence denies.
+
+        Args:
+            evidence: (C,) logarithm of the likelihood ratio of each camera being right, nats; NaN if there is none. The
+                masks' verdict about a camera stays without evidence.
+        """
+        wrong = tuple(c for c in self.wrong if not evidence[c] > 0)
+        denied = not wrong and (evidence > 0).any() and not (evidence < 0).any()
+        return replace(self, wrong=wrong, refusal="" if denied else self.refusal)
+
     @property
     def disagreement(self) -> float:
         """The mean share of the masks outside the hulls of the others."""
@@ -82,7 +101,7 @@ class Agreement:
         partners = np.isfinite(self.tangency.apart[np.ix_(self.right, self.right)]).sum(axis=1)
         if not self.wrong or not (partners == 1).any():
             return 0.0
-        return float(self.extent_m * (ERROR + 2 * np.nanmedian(self.tangency.pixel)))
+        return float(self.extent_m * (TOLERANCE + 2 * np.nanmedian(self.tangency.pixel)))
 
     @property
     def right(self) -> list[int]:
@@ -104,12 +123,12 @@ class Agreement:
 
     def reason(self, camera: int) -> str:
         """Return what is wrong with a camera."""
-        error, tolerance = self.tangency.error[camera], _tolerance(self.tangency)[camera, :, None]
-        extends, short = (error > tolerance).any(), (error < -tolerance)[self.right].any()
-        if self.outside[camera] < INCONSISTENT / 2 and not extends:
+        error = self.tangency.error[camera, self.right]
+        error, tolerance = error[np.isfinite(error)], TOLERANCE + 2 * self.tangency.pixel[camera]
+        if self.outside[camera] < INCONSISTENT / 2 and not extends(self.tangency, camera):
             return "its masks miss a part of the person"
         off = np.hypot(*self.shift_px[camera])
-        if not off > 0 and short:
+        if not off > 0 and (error < -tolerance).any():
             off = self.pairs_px[camera]
         if off > 0:
             return f"off by {off:.0f} px or more: turned, moved, late, or another camera's video"
@@ -138,13 +157,12 @@ class MaskAgreement:
         """Return (C, h, w) the same, with the pixels where others may hide the person."""
         return self.small(masks) | self.small(np.uint8(255) * (masks == OTHERS))
 
-    def compare(self, frames: Sequence[Masks], there: Bool | None = None, landmarks: Float | None = None) -> Agreement:
+    def compare(self, frames: Sequence[Masks], there: Bool | None = None) -> Agreement:
         """Return the agreement over F frames of masks (C, H, W).
 
         Args:
             frames: the masks. An empty one says that its camera sees nobody.
             there: (F, C) masks that say anything; the others are not compared. None: all.
-            landmarks: (C,) logarithm of the likelihood ratio of each camera being right, nats; NaN if there is none.
         """
         C = len(self.rig)
         if there is None:
@@ -154,68 +172,84 @@ class MaskAgreement:
         ]
         outlines = [[_outline(camera, masks[c]) for c, camera in enumerate(self.rig)] for masks in frames]
         pairs = tangency(outlines, self.rig.centers)
+        error = excess(pairs)
+        tested = np.flatnonzero(np.isfinite(error).any(axis=1)).tolist()
+        kept = largest_consistent(error)
+        # a silhouette that extends beyond no other is no contradiction: the mask misses a part, or others have a shadow
+        wrong = [c for c in tested if c not in kept and extends(pairs, c)] if kept else []
         seen = [self.small(masks) for masks in frames]
         hulls = self.hulls([self.possible(masks) for masks in frames], there)
         views = [(masks, hull) for masks, hull in zip(seen, hulls, strict=True) if hull is not None]
-        outside = cache(lambda cameras: self._outside(views, cameras))
-        verdict = most_probable(
-            PairNats.of(pairs.error, _tolerance(pairs)),
-            np.isfinite(pairs.pixel),
-            np.full(C, np.nan) if landmarks is None else landmarks,
-            outside,
-            lambda a, b: self._exchanged(frames, outlines, a, b),
-        )
-        wrong, right = verdict.wrong, [c for c in range(C) if c not in verdict.wrong]
-        if verdict.exchanged:  # the other cameras may suffice, but the remedy is known
-            a, b = (self.rig.names[c] for c in verdict.exchanged)
+        right = [c for c in range(C) if c not in wrong]
+        refused = not kept and bool(tested)
+        while not refused and (total := self._mean_outside(views, right)) > INCONSISTENT:
+            odd = self._odd(views, right, total)
+            if odd is None or len(right) - 1 <= C / 2:
+                refused = total > _REFUSED * INCONSISTENT
+                break
+            wrong.append(odd)
+            right.remove(odd)
+        accused = wrong if not refused else tested if C <= _SWAPS_OF else []
+        swapped = self._swapped(frames, outlines, accused)
+        if swapped or refused:
+            wrong, right = [], list(range(C))
+        if swapped:  # the other cameras may suffice, but the remedy is known
+            a, b = (self.rig.names[c] for c in swapped)
             refusal = f"the videos of {a} and {b} look swapped: exchange their names, and all cameras agree"
-        elif verdict.refused:
-            refusal = self._contradiction(frames, pairs)
-        elif landmarks is None or not np.nansum(landmarks) > 0:  # landmarks show depth, too
-            refusal = self._one_sided(pairs, right, wrong)
+        elif refused:
+            refusal = self._contradiction(frames, pairs, tested or right)
         else:
-            refusal = ""
-        shift = np.full((C, 2), np.nan)
+            refusal = self._one_sided(pairs, right, wrong)
+        outside, shift = np.full(C, np.nan), np.full((C, 2), np.nan)
         for c in range(C):
-            if others := [k for k in right if k != c]:
-                shift[c] = self.rig[c].reduction * self._least_shift(_silhouettes(views, c, others))
+            others = [k for k in right if k != c]
+            if others:
+                shown = _silhouettes(views, c, others)
+                outside[c] = _share_outside(shown)
+                shift[c] = self.rig[c].reduction * self._least_shift(shown)
         extents = [extent for _, hull in views if (extent := hull.extent(right)) > 0]
         return Agreement(
             names=self.rig.names,
             tangency=pairs,
-            wrong=wrong,
+            wrong=tuple(sorted(wrong)),
             refusal=refusal,
-            outside=outside(tuple(right)),
+            outside=outside,
             shift_px=shift,
             closes=np.array([hull is not None and hull.carve(range(C)).any() for hull in hulls], bool),
             extent_m=float(np.median(extents)) if extents else np.nan,
             reductions=self.rig.reductions,
         )
 
-    def _exchanged(
-        self, frames: Sequence[Masks], outlines: Sequence[Sequence[Outline | None]], a: int, b: int
-    ) -> PairNats | None:
-        """Return the errors of all pairs after two cameras' videos are exchanged; None if their sizes differ."""
-        if (self.rig[a].width, self.rig[a].height) != (self.rig[b].width, self.rig[b].height):
-            return None
-        exchanged = []
-        for masks, row in zip(frames, outlines, strict=True):
-            views = list(row)
-            views[a], views[b] = _outline(self.rig[a], masks[b]), _outline(self.rig[b], masks[a])
-            exchanged.append(views)
-        pairs = tangency(exchanged, self.rig.centers)
-        return PairNats.of(pairs.error, _tolerance(pairs))
+    def _swapped(
+        self, frames: Sequence[Masks], outlines: Sequence[Sequence[Outline | None]], accused: Sequence[int]
+    ) -> tuple[int, int] | None:
+        """Return the two accused cameras whose exchanged videos make all cameras consistent; None if no two do."""
+        found: list[tuple[float, tuple[int, int]]] = []
+        for a, b in combinations(sorted(accused), 2):
+            if (self.rig[a].width, self.rig[a].height) != (self.rig[b].width, self.rig[b].height):
+                continue
+            exchanged = []
+            for masks, row in zip(frames, outlines, strict=True):
+                views = list(row)
+                views[a], views[b] = _outline(self.rig[a], masks[b]), _outline(self.rig[b], masks[a])
+                exchanged.append(views)
+            error = excess(tangency(exchanged, self.rig.centers))
+            known = np.isfinite(error)
+            error = error[known.any(axis=1)]
+            # one partner agrees by chance
+            if known[[a, b]].sum(axis=1).min() >= 2 and np.nanmedian(error, axis=1).max() <= 1.0:
+                found.append((float(np.nanmean(error)), (a, b)))
+        return min(found)[1] if found else None
 
-    def _contradiction(self, frames: Sequence[Masks], pairs: Tangency) -> str:
+    def _contradiction(self, frames: Sequence[Masks], pairs: Tangency, cameras: Sequence[int]) -> str:
         """Return why the cameras are refused if no majority of them is consistent."""
-        cameras = np.flatnonzero(np.isfinite(pairs.pixel))
         names = [self.rig.names[c] for c in cameras]
         listed = f"{', '.join(names[:-1])} and {names[-1]}"
         if len(frames) > 1 and all(np.array_equal(masks, frames[0]) for masks in frames[1:]):
             return f"the masks of {listed} contradict each other, and they never change: do they show the person?"
         error = pairs.apart[np.ix_(cameras, cameras)]
         most = float(np.nanmax(error)) if np.isfinite(error).any() else np.nan
-        if most <= ERROR:
+        if most <= TOLERANCE:
             return (
                 f"the outlines in {listed} agree, but the working volume does not hold the person whom they show: "
                 "correct [volume] in capture.toml, or choose a first frame with the person inside (--frames N:)"
@@ -242,8 +276,7 @@ class MaskAgreement:
         there is no hull."""
         hulls = self.hulls([self.possible(masks) for masks in frames])
         views = [(self.small(masks), hull) for masks, hull in zip(frames, hulls, strict=True) if hull is not None]
-        shares = self._outside(views, cameras)[list(cameras)]
-        return float(np.nanmean(shares)) if np.isfinite(shares).any() else float("nan")
+        return self._mean_outside(views, cameras)
 
     def hulls(self, seen: Sequence[Bool], there: Bool | None = None) -> list[Hull | None]:
         """Return each frame's hulls from its small masks (C, h, w); None if no two cameras see the same voxel.
@@ -275,10 +308,29 @@ class MaskAgreement:
             result.append(voxels.hull(inside, chosen) if some and len(chosen) else None)
         return result
 
-    def _outside(self, views: Sequence[tuple[Bool, Hull]], cameras: Sequence[int]) -> Float:
-        """Return (C,) the share of each camera's masks outside the hull of the others among some; NaN if unknown."""
-        others = [[k for k in cameras if k != c] for c in range(len(self.rig))]
-        return np.array([_share_outside(_silhouettes(views, c, k)) if k else np.nan for c, k in enumerate(others)])
+    def _odd(self, views: Sequence[tuple[Bool, Hull]], cameras: Sequence[int], total: float) -> int | None:
+        """Return the camera without which the other masks lie in each other's hulls; None if there is none.
+
+        ``total`` is the mean share outside with all of them.
+        """
+        if len(cameras) < 3:
+            return None
+        without = [self._mean_outside(views, [k for k in cameras if k != c]) for c in cameras]
+        if not np.isfinite(without).any():
+            return None
+        best = int(np.nanargmin(without))
+        # with fewer cameras any hull is larger: the camera must stand out from the others' removal
+        return cameras[best] if without[best] < _LEFT_OVER * min(total, float(np.nanmedian(without))) else None
+
+    def _mean_outside(self, views: Sequence[tuple[Bool, Hull]], cameras: Sequence[int]) -> float:
+        """Return the mean share of the masks outside the hull of the others among these cameras; NaN if unknown."""
+        shares = []
+        for c in cameras:
+            others = [k for k in cameras if k != c]
+            if others:
+                shares.append(_share_outside(_silhouettes(views, c, others)))
+        known = np.isfinite(shares)
+        return float(np.array(shares)[known].mean()) if known.any() else float("nan")
 
     def _least_shift(self, pairs: Sequence[tuple[Bool, Bool]]) -> Float:
         """Return (2,) the smallest shift, the same in all frames, that moves masks into silhouettes, or NaN."""
@@ -331,9 +383,40 @@ def _share_outside(pairs: Sequence[tuple[Bool, Bool]]) -> float:
 
 def excess(pairs: Tangency) -> Float:
     """Return (C, C) the errors of all pairs in tolerances; NaN where a pair cannot be tested."""
-    return np.asarray(pairs.apart / _tolerance(pairs))
+    return np.asarray(pairs.apart / (TOLERANCE + pairs.pixel[:, None] + pairs.pixel[None]))
 
 
-def _tolerance(pairs: Tangency) -> Float:
-    """Return (C, C) the three standard deviations of the error of a right pair, as a share of the person's size."""
-    return np.asarray(ERROR + pairs.pixel[:, None] + pairs.pixel)
+def extends(pairs: Tangency, camera: int) -> bool:
+    """Return whether a camera's silhouette extends beyond that of another one."""
+    tolerance = TOLERANCE + pairs.pixel[camera] + pairs.pixel
+    return bool((pairs.error[camera] > tolerance[:, None]).any())
+
+
+def largest_consistent(error: Float) -> list[int]:
+    """Return the largest majority of the tested cameras in which every camera agrees with most of its tested partners.
+
+    Most, not all, because a mask with a fault disagrees with one or two partners, and a wrong camera with most. Of
+    several such sets the one with the least errors is returned. None is returned if another set of this size is
+    possible in which no pair tests one of the cameras: then none can be blamed.
+
+    Args:
+        error: (C, C) in tolerances; NaN where a pair cannot be tested.
+
+    Returns:
+        The cameras; empty if there is no such set.
+    """
+    tested = np.flatnonzero(np.isfinite(error).any(axis=1))
+    right, wrong = error <= 1.0, error > 1.0
+    for size in range(len(tested), len(tested) // 2, -1):
+        chosen = np.array(list(combinations(tested, size)))
+        member = np.zeros((len(chosen), len(error)), np.int64)
+        np.put_along_axis(member, chosen, 1, axis=1)
+        agree, contradict = member @ right, member @ wrong
+        possible = ((agree > contradict) | (contradict == 0) | (member == 0)).all(axis=1)
+        if possible.any():
+            supported = ((agree > 0) | (member == 0)).all(axis=1)
+            if not supported[possible].all():
+                return []
+            total = np.einsum("ni,ij,nj->n", member[possible], np.nan_to_num(error), member[possible])
+            return [int(c) for c in chosen[possible][np.argmin(total)]]
+    return []
