@@ -488,18 +488,28 @@ def test_threads_end_when_the_reader_is_deleted() -> None:
     assert all(clip.closed == 1 for clip in clips)
 
 
-def test_deleting_a_reader_does_not_wait_for_an_image() -> None:
-    """The garbage collector may delete it in a thread that the decoding threads wait for."""
+def frame_indices(clips: list[FakeClip]) -> Iterator[int]:
+    with reader_of(clips) as reader:
+        for frame_set in reader:
+            yield frame_set.index
+
+
+@pytest.mark.parametrize("generator", [False, True])
+def test_deleting_a_reader_does_not_wait_for_an_image(generator: bool) -> None:
+    """The garbage collector may delete it, or a generator that reads from it, in a thread that the decoding threads
+    wait for."""
     begun, go_on = threading.Event(), threading.Event()
 
     class Slow(FakeClip):
         def read(self, out: Any) -> None:
-            begun.set()
-            assert go_on.wait(30)
+            if self.position:
+                begun.set()
+                assert go_on.wait(30)
             super().read(out)
 
     clip = Slow(0)
-    reader = reader_of([clip])
+    reader = frame_indices([clip]) if generator else reader_of([clip])
+    next(reader)
     assert begun.wait(30)
     del reader
     gc.collect()

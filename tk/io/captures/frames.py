@@ -127,7 +127,10 @@ class FrameReader(Iterator[FrameSet]):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self.close()
+        if kind is GeneratorExit:  # perhaps by the garbage collector, in a thread that must not wait for another one
+            self._finalizer()
+        else:
+            self.close()
 
     def close(self) -> None:
         """Stop decoding and wait for the threads to end. Closing twice is fine."""
