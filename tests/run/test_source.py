@@ -381,12 +381,16 @@ def test_somebody_who_enters_later_can_be_chosen(second: tuple[Result, tuple[Sub
     assert [subject.body for subject in subjects] == [None, BODY]  # the subject is the one who is chosen
 
 
-def test_a_run_with_somebody_who_enters_later_is_resumed(everybody: tuple[Result, ...], tmp_path: Path) -> None:
+@pytest.mark.parametrize(("people", "stops"), [((1,), (12,)), ((1, 0), (3, 12))])
+def test_a_run_with_somebody_who_enters_later_is_resumed(
+    second: tuple[Result, Any], everybody: tuple[Result, ...], tmp_path: Path, people: Choice, stops: Sequence[int]
+) -> None:
     """Stopped before, and after the person enters."""
     path, end = tmp_path / "part.h5", 14
-    for stop in (3, 12):
-        track_entering(path, (1, 0), stop, resume=stop > 3)
-    for one, other in zip(track_entering(path, (1, 0), end, resume=True), everybody, strict=True):
+    for stop in stops:
+        track_entering(path, people, stop, resume=stop != stops[0])
+    whole = second[:1] if len(people) == 1 else everybody  # in the order in which they came
+    for one, other in zip(track_entering(path, people, end, resume=True), whole, strict=True):
         assert (other.status[:end] != Status.ABSENT).any()
         np.testing.assert_array_equal(one.frames, other.frames[:end])
         np.testing.assert_array_equal(one.pose, other.pose[:end])

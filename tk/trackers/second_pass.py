@@ -65,10 +65,11 @@ LEVEL = 1
 # seconds: a person who stands still is seen once, not once a frame. CORRELATED_M was chosen on rendered people
 # (docs/experiments.md, Sigma); STILL_S is assumed.
 CORRELATED_M, STILL_S = 0.2, 1.0
-# People keep their velocity: VELOCITY times a step predicts the next one best (docs/experiments.md, Second pass), and
-# the negative logarithm of a step's probability is the distance to this prediction, of the joint that is farthest
-# from it, divided by CHANGE_M. In frames with pixels of other people another pose costs SHARED nats
-# more, because the masks do not show the colours by which the first pass has chosen.
+# People keep their velocity: VELOCITY times a step predicts the next one best (docs/experiments.md, Second pass; the
+# first pass, whose poses are less exact, predicts less), and the negative logarithm of a step's probability is the
+# distance to this prediction, of the joint that is farthest from it, divided by CHANGE_M. In frames with pixels of
+# other people another pose costs SHARED nats more, because the masks do not show the colours by which the first pass
+# has chosen.
 VELOCITY, CHANGE_M, SHARED = 0.8, SAME_POSE_M, 1.0
 
 
@@ -297,8 +298,8 @@ class SecondPass:
                     for start, k, one in zip(starts[:, 0], tracked, some, strict=True):
                         start[one.dofs] = _predicted(result[k, last], pasts[k])[one.dofs]
                     poses[tracked] = self._settled(some, starts, frames[n : n + 1], seen)[:, 0]
-                goes_on = np.isfinite(known).tolist()
-                pasts = [self._past(*one, last) for one in zip(alternatives, result, goes_on, strict=True)]
+                were_tracked = np.isfinite(known).tolist()
+                pasts = [self._past(*one, last) for one in zip(alternatives, result, were_tracked, strict=True)]
                 differ = np.flatnonzero((poses != present).any(axis=1))
                 if not len(differ):
                     continue
