@@ -24,7 +24,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.body.body_fit import STATURE_DEVIATION
 from tk.model.body.joint_sigma import CONSTANT_M, directions, posture_variance
 from tk.model.body.limb_candidates import Limb, exchanged
-from tk.model.body.skeleton import JOINTS
+from tk.model.body.skeleton import JOINTS, blocks
 from tk.model.cameras.bundle import LONGEST_STEP, SEGMENT_M
 from tk.model.cues import landmarks
 from tk.model.cues.cue import Measured, in_frames
@@ -80,20 +80,39 @@ class Alternative:
     Attributes:
         dofs: the degrees of freedom in which it differs.
         limb: if they are a limb's, only this limb moves.
-        legs: the legs, if it begins with exchanged legs.
-        mode: its row, if it begins at the modes of the first pass; it never becomes the pose. Without legs or mode it
-            begins at the prediction from the neighbouring frames.
+        begins: (F, D) the poses at which it begins in each frame, NaN where it does not; None: at the prediction from
+            the neighbouring frames.
+        moves: whether a pose at which it begins shows where it was in the frame before, and so its velocity.
     """
 
     dofs: NDArray[np.int64]
     limb: Limb | None = None
-    legs: tuple[Limb, ...] = ()
-    mode: int | None = None
+    begins: Float | None = None
+    moves: bool = True
 
-    @property
-    def goes_on(self) -> bool:
-        """Whether it begins where the present pose would go, so that both have the same past."""
-        return not self.legs and self.mode is None
+
+class Tracks(NamedTuple):
+    """A alternatives, tracked through F frames in one direction.
+
+    Attributes:
+        poses: (A, F, D).
+        found: (A, F) whether an alternative differs from the pose that was the present one, and is not improbable.
+        cost: (A, F) by how much it costs more than that pose, nats; 0 where it is not found.
+    """
+
+    poses: Float
+    found: NDArray[np.bool_]
+    cost: Float
+
+    def of(self, rows: slice) -> Tracks:
+        """Return some alternatives."""
+        return Tracks(*(values[rows] for values in self))
+
+    def beside(self, other: Tracks) -> Tracks:
+        """Return these alternatives, and in frames in which they are not found those of another direction."""
+        pairs = zip(self, other, strict=True)
+        shown = (np.where(self.found.reshape(self.found.shape + (1,) * (a.ndim - 2)), a, b) for a, b in pairs)
+        return Tracks(*shown)
 
 
 class SecondPass:
@@ -230,35 +249,42 @@ class SecondPass:
 
     def decide(self) -> None:
         """Track other poses of the limbs in both directions, and replace the present ones where these are likelier;
-        then those that the first pass left open."""
-        arms = [Alternative(limb.dofs, limb) for limb in self.tracker.limbs if limb.name.startswith("arm")]
-        rest = np.setdiff1d(np.arange(self.poses.shape[1]), np.concatenate([arm.dofs for arm in arms]))
-        legs = tuple(limb for limb in self.tracker.limbs if limb.name.startswith("leg"))
-        every = np.arange(self.poses.shape[1])
-        alternatives = [Alternative(every), Alternative(rest, legs=legs), *arms]
+        with them those that the first pass left open."""
+        limbs, every = self.tracker.limbs, np.arange(self.poses.shape[1])
+        arms = [Alternative(limb.dofs, limb) for limb in limbs if limb.name.startswith("arm")]
+        legs = tuple(limb for limb in limbs if limb.name.startswith("leg"))
+        rest = np.setdiff1d(every, np.concatenate([arm.dofs for arm in arms]))
+        open_ = [] if self._modes is None else list(self._modes.swapaxes(0, 1))
+        modes = [Alternative(limb.dofs, limb, poses, moves=False) for limb in limbs for poses in open_]
+        done: list[Tracks] = []
         for step in (1, -1):
-            for one, poses, cost in zip(alternatives, *self._track(alternatives, step), strict=True):
-                other, likelier = self._compared(one, poses, cost)
+            swapped = np.full_like(self.poses, np.nan)
+            tracked = [exchanged(poses, [legs])[0] for poses in blocks(self.poses[self.tracked])]
+            swapped[self.tracked] = np.concatenate(tracked)
+            others = [Alternative(every), Alternative(rest, begins=swapped), *arms]
+            tracks = self._track([*others, *modes], step)
+            for k, one in enumerate(others):
+                other, likelier = self._compared(one, *(values[k] for values in tracks))
                 self.poses[likelier] = other[likelier]
-        if self._modes is not None:
-            rows = range(self._modes.shape[1])
-            modes = [Alternative(limb.dofs, limb, mode=k) for limb in self.tracker.limbs for k in rows]
-            (ahead, cost), (back, cost_back) = (self._track(modes, step) for step in (1, -1))
-            found = (ahead != self.poses).any(axis=-1)
-            cost = np.where(found, cost, cost_back)
-            for one, poses, of_frames in zip(modes, np.where(found[..., None], ahead, back), cost, strict=True):
-                self._compared(one, poses, of_frames)
+                change = tracks.cost[k, likelier].copy()
+                for known in (*done, tracks):
+                    known.cost[:, likelier] -= change
+            done.append(tracks.of(slice(len(others), None)))
+        for one, poses, found, cost in zip(modes, *done[0].beside(done[1]), strict=True):
+            self._compared(one, poses, found, cost)
 
-    def _compared(self, one: Alternative, poses: Float, cost: Float) -> tuple[Float, NDArray[np.int64]]:
-        """Return the present poses (F, D) with an alternative's limbs, from its poses (F, D), and the frames in which
-        they are likelier, by its cost (F,); add the spread of the two to the variance."""
+    def _compared(
+        self, one: Alternative, poses: Float, found: NDArray[np.bool_], cost: Float
+    ) -> tuple[Float, NDArray[np.int64]]:
+        """Return the present poses (F, D) with an alternative's limbs, where it is found, and the frames in which these
+        are likelier; add the spread of the two to the variance. Arguments as in :class:`Tracks`."""
         skeleton, frames, other = self.tracker.body.skeleton, self.tracked, self.poses.copy()
-        other[:, one.dofs] = poses[:, one.dofs]
+        other[np.ix_(found, one.dofs)] = poses[np.ix_(found, one.dofs)]
         joints = skeleton.joints(np.array([self.poses[frames], other[frames]]))
-        share = second_of_two(cost[frames], _surprises(joints, frames) / CHANGE_M)
+        share = second_of_two(np.where(found, cost, 0.0)[frames], _surprises(joints, frames) / CHANGE_M)
         apart = ((joints[1] - joints[0]) ** 2).sum(axis=-1) / 3
         self._variance[1, frames] += (share * (1.0 - share))[:, None] * apart
-        return other, frames[share > 0.5]
+        return other, frames[(share > 0.5) & found[frames]]
 
     def _interpolate(self) -> None:
         """Set angles that only landmarks show between those of the frames in which two images or more have landmarks:
@@ -270,15 +296,11 @@ class SecondPass:
         for k in np.flatnonzero(self.tracker.body.skeleton.is_by_landmarks) if len(seen) else ():
             self.poses[self.tracked, k] = np.interp(self.tracked, seen, self.poses[seen, k])
 
-    def _track(self, alternatives: Sequence[Alternative], step: int) -> tuple[Float, Float]:
-        """Track A alternatives forwards (``step`` 1) or backwards (-1).
-
-        Returns:
-            poses (A, F, D), and by how much they cost more than the present ones (A, F). Where an alternative has
-            become the present pose, or is improbable beside them, its pose is the present one.
-        """
+    def _track(self, alternatives: Sequence[Alternative], step: int) -> Tracks:
+        """Track alternatives forwards (``step`` 1) or backwards (-1) beside the present poses."""
         order, result = self.tracked[::step], np.repeat(self.poses[None], len(alternatives), axis=0)
-        cost, mean = np.zeros(result.shape[:2]), np.full(len(alternatives), np.nan)  # NaN: none is tracked
+        found, cost = np.zeros(result.shape[:2], bool), np.zeros(result.shape[:2])
+        mean = np.full(len(alternatives), np.nan)  # of the cost; NaN: none is tracked
         pasts: list[Float | None] = [None] * len(alternatives)  # (D,) their poses in the frame before the last
         for begin in range(0, len(order) - 1, AT_ONCE):
             frames = order[begin + 1 : begin + 1 + AT_ONCE]
@@ -286,7 +308,7 @@ class SecondPass:
             # most alternatives become the present pose at once: those that begin are settled together
             starts = np.stack([self._starts(one, lasts, frames, step) for one in alternatives])
             begun = self._settled(alternatives, starts, frames, seen)
-            self._advance(len(frames))
+            self._advance(2 * len(frames))
             for n, (last, i) in enumerate(zip(lasts.tolist(), frames.tolist(), strict=True)):
                 known, mean = mean, np.full(len(alternatives), np.nan)
                 if i != last + step:
@@ -308,36 +330,32 @@ class SecondPass:
                 more = costs[1:] - costs[0]
                 mean[differ] = np.where(np.isnan(known[differ]), more, known[differ] + RENEWAL * (more - known[differ]))
                 mean[mean > DROPPED] = np.nan
-                kept = np.isfinite(mean[differ])
+                kept = differ[np.isfinite(mean[differ])]
                 # a limb behind other people costs nothing, and only the first pass sees its colours
                 hidden = SHARED * (pyramid.masks[0] == OTHERS).any()
-                result[differ[kept], i] = poses[differ[kept]]
-                cost[differ[kept], i] = self._share[i] * more[kept] + hidden
-        return result, cost
+                result[kept, i], found[kept, i] = poses[kept], True
+                cost[kept, i] = self._share[i] * more[np.isfinite(mean[differ])] + hidden
+        return Tracks(result, found, cost)
 
     def _starts(self, one: Alternative, lasts: NDArray[np.int64], frames: NDArray[np.int64], step: int) -> Float:
         """Return the poses (N, D) from which an alternative begins in N frames; the present one where it does not."""
         poses, follows = self.poses[frames], frames == lasts + step
-        if one.mode is not None:
-            assert self._modes is not None
-            angles = self._modes[frames, one.mode][:, one.dofs]
+        if one.begins is not None:
+            angles = one.begins[frames][:, one.dofs]
             known = np.flatnonzero(np.isfinite(angles).all(axis=1))
             poses[np.ix_(known, one.dofs)] = angles[known]
-        elif one.goes_on:
+        else:
             for n in np.flatnonzero(follows).tolist():
                 past = self.poses[lasts[n] - step] if lasts[n] - step in self._seen else None
                 poses[n, one.dofs] = _predicted(self.poses[lasts[n]], past)[one.dofs]
-        else:
-            for n in np.flatnonzero(follows).tolist():
-                poses[n] = exchanged(poses[n], [one.legs])[0]
         return poses
 
     def _past(self, one: Alternative, poses: Float, tracked: bool, frame: int) -> Float | None:
         """Return the pose (D,) in a frame of an alternative with poses (F, D), which was tracked there or begins in the
         next frame; None if it is unknown."""
-        if tracked or one.goes_on:
+        if tracked or one.begins is None:
             return np.asarray(poses[frame])
-        return exchanged(self.poses[frame], [one.legs])[0] if one.legs else None
+        return np.asarray(one.begins[frame]) if one.moves else None
 
     def _settled(
         self,
@@ -351,21 +369,22 @@ class SecondPass:
         tracker, skeleton, present = self.tracker, self.tracker.body.skeleton, self.poses[frames]
         joints, result = skeleton.joints(present), np.repeat(present[None], len(alternatives), axis=0)
         far = skeleton.apart(starts, joints) > SAME_POSE_M
-        for one, poses, start, differ in zip(alternatives, result, starts, far, strict=True):
-            if differ.any():
-                pyramid = Pyramid.of_all([seen(i) for i in frames[differ].tolist()], LEVEL)
-                prior = tracker.prior(start[differ], ANGLE_DEG)
-                poses[differ] = tracker.settle(pyramid, start[differ], (LEVEL,), prior=prior, limb=one.limb).states
+        for limb in dict.fromkeys(one.limb for one in alternatives):  # those of a limb are settled together
+            own = far & np.array([one.limb is limb for one in alternatives])[:, None]
+            if own.any():
+                start, shown = starts[own], frames[np.nonzero(own)[1]]
+                pyramid = Pyramid.of_all([seen(i) for i in shown.tolist()], LEVEL)
+                prior = tracker.prior(start, ANGLE_DEG)
+                result[own] = tracker.settle(pyramid, start, (LEVEL,), prior=prior, limb=limb).states
         if far.any():
             result = np.where(skeleton.apart(result, joints)[..., None] > SAME_POSE_M, result, present)
         return result
 
     def _advance(self, frames: int) -> None:
-        """Report the share that is done: every frame is settled once, tracked twice and smoothed in all rounds; where
-        there are modes, it is tracked twice more."""
+        """Report the share that is done: every frame is settled once, tracked in both directions, which takes as long
+        as four rounds, and smoothed in all rounds."""
         self._done += frames
-        rounds = 3 + ROUNDS + (0 if self._modes is None else 2)
-        self._report(min(self._done / (rounds * len(self.tracked)), 1.0))
+        self._report(min(self._done / ((5 + ROUNDS) * len(self.tracked)), 1.0))
 
     def _together(self, frames: NDArray[np.int64]) -> Pyramid:
         """Return the finest scale of some frames."""

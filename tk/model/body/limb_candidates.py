@@ -106,20 +106,20 @@ def pairs(limbs: Sequence[Limb]) -> list[tuple[Limb, ...]]:
     return [tuple(pair) for pair in kinds if len(pair) == 2]
 
 
-def exchanged(pose: Float, both: Sequence[tuple[Limb, ...]]) -> Float:
-    """Return a pose (N, D) for each of N pairs of limbs: the pose (D,) with their joints at each other's places as
-    nearly as the limits allow.
+def exchanged(poses: Float, both: Sequence[tuple[Limb, ...]]) -> Float:
+    """Return poses (N, ..., D), one for each of N pairs of limbs: poses (..., D) with their joints at each other's
+    places as nearly as the limits allow.
 
     Their angles are exchanged, then corrected by damped Gauss-Newton steps, since the limbs begin at different joints.
     """
-    joints, together = both[0][0].skeleton.joints(pose), pose.copy()
+    together = poses.copy()
     for one, other in both:
-        together[one.dofs], together[other.dofs] = pose[other.dofs], pose[one.dofs]
-    together = _placed(together, both, joints)
-    result = np.repeat(pose[None], len(both), axis=0)
-    for row, pair in zip(result, both, strict=True):
+        together[..., one.dofs], together[..., other.dofs] = poses[..., other.dofs], poses[..., one.dofs]
+    together = _placed(together, both, both[0][0].skeleton.joints(poses))
+    result = np.repeat(poses[None], len(both), axis=0)
+    for found, pair in zip(result, both, strict=True):
         for limb in pair:
-            row[limb.dofs] = together[limb.dofs]
+            found[..., limb.dofs] = together[..., limb.dofs]
     return result
 
 
@@ -135,18 +135,19 @@ def turned(pose: Float, limbs: Sequence[Limb]) -> Float:
     return _placed(result, both, skeleton.joints(pose))
 
 
-def _placed(pose: Float, both: Sequence[tuple[Limb, ...]], joints: Float) -> Float:
-    """Return a pose (D,) whose joints of each pair are as near to each other's places among ``joints`` (J, 3) as the
-    limits allow. Pairs do not depend on each other."""
-    skeleton, result = both[0][0].skeleton, pose.copy()
+def _placed(poses: Float, both: Sequence[tuple[Limb, ...]], joints: Float) -> Float:
+    """Return poses (..., D) whose joints of each pair are as near to each other's places among ``joints`` (..., J, 3)
+    as the limits allow. Pairs do not depend on each other."""
+    skeleton, result = both[0][0].skeleton, poses.copy()
     for _ in range(_EXCHANGE_STEPS):
         jacobian, present = skeleton.joint_jacobian(result), skeleton.joints(result)
         for one, other in both:
             dofs, moved = np.concatenate([one.dofs, other.dofs]), one.joints + other.joints
-            J = jacobian[moved][..., dofs].reshape(-1, len(dofs))
-            missing = (joints[other.joints + one.joints] - present[moved]).ravel()
-            step = np.linalg.solve(J.T @ J + _EXCHANGE_DAMPING * np.eye(len(dofs)), J.T @ missing)
-            result[dofs] = np.clip(result[dofs] + step, skeleton.lower[dofs], skeleton.upper[dofs])
+            J = jacobian[..., moved, :, :][..., dofs].reshape(*result.shape[:-1], -1, len(dofs))
+            missing = (joints[..., other.joints + one.joints, :] - present[..., moved, :]).reshape(*J.shape[:-1], 1)
+            across = J.swapaxes(-1, -2)
+            step = np.linalg.solve(across @ J + _EXCHANGE_DAMPING * np.eye(len(dofs)), across @ missing)[..., 0]
+            result[..., dofs] = np.clip(result[..., dofs] + step, skeleton.lower[dofs], skeleton.upper[dofs])
     return result
 
 
