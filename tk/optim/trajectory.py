@@ -45,7 +45,15 @@ class Equations:
         """D, the number of a block's own unknowns."""
         return self.gradient.shape[1] - len(self.prior_gradient)
 
-    def add(self, block: int, columns: Sequence[slice], rows: Float, weight: Float, residual: Float) -> None:
+    def add(
+        self,
+        block: int,
+        columns: Sequence[slice],
+        rows: Float,
+        weight: Float,
+        residual: Float,
+        parts: Sequence[tuple[slice, slice, Float]] = (),
+    ) -> None:
         """Add rows to a block's equations.
 
         Args:
@@ -54,16 +62,26 @@ class Equations:
             rows: (N, K) derivatives.
             weight: (N,) information of each row.
             residual: (N,) by how much each row's value should grow.
+            parts: rows that no other part has, other unknowns than ``columns``, and the rows' derivatives by them.
         """
         root = np.sqrt(weight)
-        scaled = rows * root[:, None]
-        A, y = scaled.T @ scaled, scaled.T @ (root * residual)  # a symmetric product takes half the time
+        scaled, y = rows * root[:, None], residual * root
+        A, g = scaled.T @ scaled, scaled.T @ y  # a symmetric product takes half the time
         ends = np.cumsum([part.stop - part.start for part in columns])
         own = [slice(end - (part.stop - part.start), end) for part, end in zip(columns, ends.tolist(), strict=True)]
+        hessian, gradient = self.hessian[block], self.gradient[block]
         for i, into in zip(own, columns, strict=True):
-            self.gradient[block, into] += y[i]
+            gradient[into] += g[i]
             for j, across in zip(own, columns, strict=True):
-                self.hessian[block, into, across] += A[i, j]
+                hessian[into, across] += A[i, j]
+        for some, into, derivatives in parts:
+            part = derivatives * root[some, None]
+            gradient[into] += part.T @ y[some]
+            hessian[into, into] += part.T @ part
+            A = part.T @ scaled[some]
+            for j, across in zip(own, columns, strict=True):
+                hessian[into, across] += A[:, j]
+                hessian[across, into] += A[:, j].T
 
     def add_block_prior(self, block: int, precision: Float, difference: Float) -> None:
         """Add a prior on a block: precision (D,) and the difference (D,) from the estimate to the prior's mean."""

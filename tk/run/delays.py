@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,13 +103,10 @@ def retimed(store: MaskStore, frames: NDArray[np.int64], late: NDArray[np.int64]
     """Return the masks of frames (F,) of cameras that are late by whole frames (C,); empty if a camera has no image."""
     if not late.any():
         return store
-    result = MaskStore()
+    result, stored = MaskStore(), lru_cache(16)(store.get)
     for frame in frames.tolist():
-        own = store.get(frame)
-        layers = [
-            store.get(frame - n)[c] if frame - n in store else np.zeros_like(own[c])
-            for c, n in enumerate(late.tolist())
-        ]
+        none = np.zeros_like(stored(frame)[0])
+        layers = [stored(frame - n)[c] if frame - n in store else none for c, n in enumerate(late.tolist())]
         result.put(frame, np.stack(layers))
     return result
 

@@ -55,6 +55,9 @@ Float = NDArray[np.float64]
 REMEMBERED = 8
 # Poses of a recording that are placed at once: a pose needs 16 kB of temporary memory.
 _BLOCK = 1024
+# Up to so many poses are placed in few rounds of products, more of them with few products: a call takes as long as
+# about 50 products.
+_FEW = 8
 
 
 _AHEAD, _BEHIND = [1, 2, 0], [2, 0, 1]  # axes after and before each of the three
@@ -135,6 +138,16 @@ class Skeleton:
         return tuple(np.flatnonzero(depth == d) for d in range(depth.max() + 1))
 
     @cached_property
+    def _products(self) -> tuple[list[tuple[NDArray[np.int64], NDArray[np.int64]]], ...]:
+        """Rounds of products of transforms, each degrees of freedom and those above them by whose transforms they are
+        multiplied: with the fewest products, and with the fewest rounds, in each of which the way up doubles."""
+        doubling, above = [], self.parent
+        while (below := np.flatnonzero(above >= 0)).size:
+            doubling.append((below, above[below]))
+            above = np.where(above >= 0, above[above], -1)
+        return [(level, self.parent[level]) for level in self._levels[1:]], doubling
+
+    @cached_property
     def _raised(self) -> NDArray[np.int64]:
         """The degrees of freedom that lift a shoulder: with the one behind it each turns the arm up."""
         return np.flatnonzero(self.rise.any(axis=1))
@@ -171,8 +184,9 @@ class Skeleton:
             steps[..., k, :3, 3] += self.rise[k] * arm_elevation(pose[..., k], pose[..., k + 1])[..., None]
         steps[..., 3, 3] = 1.0
         result = steps
-        for level in self._levels[1:]:
-            result[..., level, :, :] = result[..., self.parent[level], :, :] @ steps[..., level, :, :]
+        # calls take most of the time of few poses, products that of many
+        for below, above in self._products[pose.size <= _FEW * pose.shape[-1]]:
+            result[..., below, :, :] = result[..., above, :, :] @ result[..., below, :, :]
         return result
 
     def segment_moves(self, poses: Float, point: Float, rise: Float) -> Float:

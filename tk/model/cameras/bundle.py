@@ -188,19 +188,19 @@ class ContourBundle:
             by_segment = np.zeros((len(x), len(SEGMENTS) if L else 0, 3))
             if L:
                 by_segment[np.arange(len(x)), linear.body.frames[0][edgels.part]] = edgels.row
-            by_pose = np.hstack([linear.pose_rows(at, edgels, x), by_segment.reshape(len(x), L)])
-            by_body = linear.rows(at, edgels)
-            for view, i, j in zip(views, [0, *ends], ends, strict=False):
+            rows = np.hstack([linear.pose_rows(at, edgels, x), by_segment.reshape(len(x), L), linear.rows(at, edgels)])
+            parts = []
+            for view, i, j in zip(views, [0, *ends], ends, strict=False) if self.parameters else ():
                 by_camera = [
-                    (by_pose[i:j, :P] @ self.frames[view.frame].velocity)[:, None]
+                    (rows[i:j, :P] @ self.frames[view.frame].velocity)[:, None]
                     if name == "offset"
                     else camera_rows(state.rig[view.camera], x[i:j], view.edgels, name)
                     for name in self.parameters
                 ]
                 own = D + view.camera * k
-                columns = [slice(0, D), slice(own, own + k), slice(D + S - K, D + S)]
-                rows = np.hstack([by_pose[i:j], *by_camera, by_body[i:j]])
-                found.add(view.frame, columns, rows, self._information * view.edgels.weight, view.edgels.distance)
+                parts.append((slice(i, j), slice(own, own + k), np.hstack(by_camera)))
+            columns, weight = [slice(0, D), slice(D + S - K, D + S)], self._information * edgels.weight
+            found.add(views[0].frame, columns, rows, weight, edgels.distance, parts)
         marked = [f for f, frame in enumerate(self.frames) if MARKED in frame.pyramid.measured]
         if marked:
             # a network's depth is too cautious, by an unknown share: it says nothing about the body's lengths

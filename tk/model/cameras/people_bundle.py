@@ -73,6 +73,8 @@ class PeopleBundle:
         """Return the equations at an estimate and a scale's index. The blocks are the frames of one person after those
         of the other; the cameras' prior counts once."""
         own = [bundle.linearise(state, scale) for bundle, state in zip(self.bundles, states, strict=True)]
+        if len(own) == 1:
+            return own[0]
         D = own[0].gradient.shape[1] - len(self._shared[0])
         whole = Equations(self._blocks[-1].stop, D, self.size)
         for one, rows, shared in zip(own, self._blocks, self._shared, strict=True):
