@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from tk.people.person import Answer
 from tk.run.offline import REFINED
 from tk.run.plan import Plan
 from tk.run.prefetch import Observed
+from tk.run.segmentation import landmark_asker
 from tk.threads import one_thread
 from tk.trackers.protocol import Estimate, Frame, shows_person, two_pass
 
@@ -105,6 +107,7 @@ class Loop:
         self._held: list[tuple[Row, dict[int, Row]]] = []  # of frames that are not in the file yet
         task = plan.task
         self.people = People(task.setup, task.settings, task.options.people, plan.tracker, note)
+        self._ask = landmark_asker(task)
 
     def estimates(self) -> Iterator[tuple[Estimate, ...]]:
         """Start or restore the trackers, step them to the end and yield the estimates of all people in each frame; they
@@ -244,6 +247,8 @@ class Loop:
     def _step(self, observation: Frame) -> tuple[Estimate, ...] | None:
         """Step all trackers; return the estimates of the people in the result, None before the first frame to be
         written."""
+        if self._ask is not None:
+            observation = replace(observation, ask=partial(self._ask, observation.images))
         with one_thread():
             answers = self.people.step(observation)
         if observation.index < self.plan.begin:

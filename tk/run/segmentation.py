@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from functools import cache
+from typing import TYPE_CHECKING, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,8 +18,11 @@ from tk.model.masks.foreground import CollinearityForeground, Foreground
 from tk.model.masks.image_shift import exchanged_scenes
 from tk.run.learned_masks import MASK_SOURCES, LearnedMasks
 from tk.run.task import Task
-from tk.segmenters import INSTALL, load, names
+from tk.segmenters import INSTALL, at_hand, load, names
 from tk.threads import one_thread
+
+if TYPE_CHECKING:
+    from tk.segmenters.people_masks import PeopleMasks
 
 
 class Labels(NamedTuple):
@@ -35,6 +40,7 @@ class Labels(NamedTuple):
 
 
 Labeller = Callable[[FrameSet], Labels]
+LandmarkAsker = Callable[[NDArray[np.uint8], NDArray[np.float64]], NDArray[np.float64] | None]
 
 # what :func:`mask_source` returns; "none": no masks are given, they are made from the empty scene
 _GIVEN, _SCENE, _MEDIAN, _SEGMENTER = "given", "none", "median", "segmenter "
@@ -101,8 +107,41 @@ def make_labeller(task: Task, note: Callable[[str], None]) -> Labeller:
 
 def sees_landmarks(task: Task) -> bool:
     """Return whether a network's landmarks are used in some frames."""
-    asked = task.settings.landmarks
-    return asked == "always" or (asked == "auto" and bool(sources_of_masks(task.source)))
+    return task.settings.landmarks == "always" or _asked_for_landmarks(task) is not None
+
+
+def _asked_for_landmarks(task: Task) -> str | None:
+    """Return the segmenter that trackers ask for landmarks: the one that makes the masks, or else one that is installed
+    with its weights. None: they ask none."""
+    if task.settings.landmarks == "never":
+        return None
+    if task.source.segmenter is not None:
+        return type(task.source.segmenter).__name__
+    origin = mask_source(task.source)
+    return origin.removeprefix(_SEGMENTER) if origin.startswith(_SEGMENTER) else at_hand()
+
+
+def landmark_asker(task: Task) -> LandmarkAsker | None:
+    """Return what trackers ask for a person's landmarks where silhouettes leave a pose open: a function from images
+    (C, h, w, 3), which may be reduced, and the places (L, 3) where the landmarks are expected, world frame, metres.
+
+    It returns landmarks (C, L, 4), None if nobody can be there. The network is loaded when it is first asked.
+    """
+    if (name := _asked_for_landmarks(task)) is None:
+        return None
+    size = task.setup.rig.frame_shape[::-1]
+
+    @cache
+    def network() -> PeopleMasks:
+        from tk.segmenters.people_masks import PeopleMasks  # SciPy, which takes a second to import
+
+        return PeopleMasks(task.source.segmenter or load(name), name, task.setup.rig, task.setup.volume)
+
+    def ask(images: NDArray[np.uint8], points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        whole = np.stack([cv2.resize(image, size, interpolation=cv2.INTER_LINEAR) for image in images])
+        return network().landmarks(whole, points)
+
+    return ask
 
 
 def _with_landmarks(task: Task, labeller: Labeller) -> Labeller:

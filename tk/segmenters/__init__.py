@@ -73,6 +73,17 @@ def names() -> tuple[str, ...]:
     return (*others, *built_in)
 
 
+def at_hand() -> str | None:
+    """Return the segmenter that is used where nobody has asked for one: the first one that is installed, if its weights
+    are, too."""
+    installed = names()
+    if not installed or installed[0] != _BUILT_IN:
+        return installed[0] if installed else None
+    from tk.segmenters import weights
+
+    return _BUILT_IN if weights.at_hand() else None
+
+
 def load(name: str) -> Segmenter:
     """Return the segmenter of this name.
 

@@ -154,6 +154,16 @@ class PeopleMasks:
         landmarks = associated(self._rig, landmarks)
         return Segmented(masks, uncertain & (masks == 0), landmarks, bits, known if len(known) == len(people) else None)
 
+    def landmarks(self, images: Images, points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Return the landmarks (C, L, 4) in images (C, H, W, 3) of a person whose landmarks are expected at points
+        (L, 3), world frame, metres; None if nobody can be there."""
+        if (place := SeenPerson.at(points)) is None:
+            return None
+        person, cameras = self._empty(self._patches(place)), range(len(images))
+        self._each(lambda c: self._segment(images, c, person), cameras)
+        self._compare(images, person, cameras)
+        return person.landmarks
+
     def without_specks(self, masks: Images) -> Images:
         """Return masks (C, H, W) without small parts that no other camera shows: shadows, reflections."""
         if all(cv2.connectedComponents(mask)[0] <= 2 for mask in masks):  # the scene and one part

@@ -64,6 +64,12 @@ def weights() -> dict[str, Path]:
     return found
 
 
+def at_hand() -> bool:
+    """Return whether :func:`weights` downloads nothing."""
+    folder = default_cache_dir() / "segmenter"
+    return all(_installed(name) or (folder / name).is_file() for name in FILES)
+
+
 def _is_right(name: str, data: bytes) -> bool:
     return hashlib.sha256(data).hexdigest() == FILES[name][1]
 

@@ -46,6 +46,8 @@ class Frame:
             :mod:`tk.model.cues.landmarks`; NaN where they are unknown. None if no network saw this frame.
         people: (C, H, W) uint8, bit n: the network's mask of person n of ``landmarks`` shows the pixel. None if no
             network saw this frame.
+        ask: returns the landmarks (C, L, 4) of the person whose landmarks are expected at places (L, 3), world frame,
+            metres, or None; None if no network can be asked.
     """
 
     index: int
@@ -56,6 +58,7 @@ class Frame:
     sources: NDArray[np.uint8] | None = None
     landmarks: NDArray[np.float64] | None = None
     people: NDArray[np.uint8] | None = None
+    ask: Callable[[Float], Float | None] | None = None
 
 
 @dataclass(frozen=True)

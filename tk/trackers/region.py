@@ -102,6 +102,7 @@ class RegionState:
         view_m: see :class:`RegionTracker`.
         spread: (J,) variance of the joints' positions along an axis, metres², over the modes of the last limb search.
         fresh: whether no frame has been tracked yet.
+        since_asked: frames since a network was asked for landmarks.
     """
 
     alive: list[Hypothesis]
@@ -115,6 +116,7 @@ class RegionState:
     view_m: float
     spread: Float
     fresh: bool
+    since_asked: int
 
 
 class RegionTracker(ContourTracker[RegionState]):
@@ -153,7 +155,7 @@ class RegionTracker(ContourTracker[RegionState]):
         self._mean_posture: Float = np.zeros((len(JOINTS), 3))
         self._postures = 0
         self._spread: Float = np.zeros(len(JOINTS))
-        self._fresh = True
+        self._fresh, self._since_asked = True, self.search_frames
         self.view_m = CHANGING_M
         self._reset()
 
@@ -251,14 +253,18 @@ class RegionTracker(ContourTracker[RegionState]):
         misplaced = self.misplaced(evidence, look.label)
         searched = self._needs_search(frame, look, misplaced, evidence.hidden(look.label))
         best = self._best.pose
-        proposed = [of_landmarks.propose(self, seen, best)]
+        self._since_asked += 1
         if searched:
             found = limbs.modes(self, seen, best, self.limbs if self._fresh else misplaced)
+            if self._is_open(limbs.spread(self.body.skeleton, best, best, found)) and (asked := self._ask(seen, best)):
+                seen, found = asked, limbs.weighed(self, asked, best, found)
+        proposed = [of_landmarks.propose(self, seen, best)]
+        if searched:
             proposed += [limbs.propose(self, seen, best, found), exchanged.propose(self, seen, best)]
             proposed.append(of_heading.propose(self, seen, best))
         if self._choose(seen, *proposed):
             look = self._look(seen)
-        modes = None
+        evidence, modes = seen.evidence, None
         if searched:
             self._spread = limbs.spread(self.body.skeleton, self._best.pose, best, found)
             modes = limbs.others(self._best.pose, best, found)
@@ -298,8 +304,27 @@ class RegionTracker(ContourTracker[RegionState]):
             residual=look.residual,
             masks=pyramid.masks[0],
             drawn=look.label > 0,
-            landmarks=pyramid.measured.get(landmarks.NAME),
+            landmarks=seen.pyramid.measured.get(landmarks.NAME),
         )
+
+    def _is_open(self, variance: Float) -> bool:
+        """Return whether a network tells more about the joints than a frame whose modes have a variance (J,), metres²:
+        a landmark that is seen has a smaller error. Its answers in neighbouring frames are alike, so it is asked once
+        between two routine searches."""
+        return self._since_asked >= self.search_frames and bool((variance > landmarks.deviation(1.0) ** 2).any())
+
+    def _ask(self, seen: Seen, pose: Float) -> Seen | None:
+        """Return what a frame shows with a network's landmarks of the person, who is expected at a pose (D,); None if
+        there is no network, the frame has its landmarks, or they show somebody else."""
+        frame, pyramid = seen.frame, seen.pyramid
+        if frame.ask is None or frame.landmarks is not None or not frame.images.size:
+            return None
+        self._since_asked = 0
+        found = frame.ask(self.world.points_out(landmarks.points(self.body, pose)))
+        marked = landmarks.of_person(None if found is None else found[None], pyramid.masks[0])
+        if marked is None:
+            return None
+        return self.see(frame, seen.images, replace(pyramid, measured=pyramid.measured | {landmarks.NAME: marked}))
 
     def without_foreign(self, frame: Frame) -> Frame:
         """Return the frame with masks that exclude carried objects: large areas of colours that are not the person's.

@@ -393,6 +393,11 @@ def propose(rig: Rig, body: ConeBody, seen: Float, p_near: Float) -> Float:
     return np.asarray(poses[np.argsort(LandmarkCue(rig, body, seen).cost(poses), kind="stable")])
 
 
+def points(body: ConeBody, pose: Float) -> Float:
+    """Return the places (L, 3) of the landmarks of a body at a pose (D,), in its world, metres."""
+    return body.skeleton.points(pose, SEGMENT, places(body.dimensions) @ body.skeleton.T_world_body.T)
+
+
 def of_person(landmarks: Float | None, masks: NDArray[np.uint8]) -> Float | None:
     """Choose, among the landmarks of N people (N, V, L, 4), those (V, L, 4) of the person in masks (V, H, W).
 

@@ -80,6 +80,17 @@ def modes(finder: ContourFinder, seen: Seen, pose: Float, misplaced: Sequence[Li
     return found
 
 
+def weighed(finder: ContourFinder, seen: Seen, pose: Float, found: Sequence[Modes]) -> list[Modes]:
+    """Return modes, arguments as for :func:`propose`, with their costs by what a frame shows now."""
+    own, result = seen.evidence.cost(finder.body, pose[None])[0], []
+    for one in found:
+        more = seen.evidence.cost(finder.body, one.poses) - own
+        kept = np.argsort(more, kind="stable")
+        kept = kept[more[kept] < DROPPED]
+        result.append(Modes(one.limb, one.poses[kept], more[kept]))
+    return result
+
+
 def propose(finder: ContourFinder, seen: Seen, pose: Float, found: Sequence[Modes]) -> Float:
     """Return the cheapest (B, D) of the best modes of each limb, and of combinations of two limbs.
 
