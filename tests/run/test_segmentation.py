@@ -14,14 +14,15 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.conftest import QUICK, Silent, Tk
-from tests.people import install, truth, write_people
+from tests.people import HEIGHT, WIDTH, install, truth, write_people
 from tk.errors import CaptureError, ConfigError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.kernels.background import Statistic
+from tk.model.body.body_points import LANDMARKS
 from tk.run.mask_folder import write_masks
 from tk.run.prefetch import Ahead, open_observations
-from tk.run.segmentation import make_labeller, mask_source, prepare_kernels
+from tk.run.segmentation import landmark_asker, make_labeller, mask_source, prepare_kernels, sees_landmarks
 from tk.run.task import Task
 from tk.segmenters import load, names
 from tk.segmenters.people_masks import PeopleMasks
@@ -219,6 +220,46 @@ def test_a_segmenter_may_be_an_object(walk: Path) -> None:
     with open_observations(Task.of(capture, Settings()), lambda _: None) as observations:
         (observation, _), *_ = observations.frames(0, 2)
     assert observation.masks.any(axis=(1, 2)).all() and (observation.masks == 0).mean() > 0.5
+
+
+class Pose(Scarlet):
+    """A segmenter that also sees landmarks: all of them on a line in the middle of its image."""
+
+    landmarks = LANDMARKS
+
+    def segment_pose(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        height, width = image.shape[:2]
+        y = np.linspace(0.45, 0.55, len(LANDMARKS)) * height
+        return self.segment(image), np.column_stack([np.full_like(y, width / 2), y, np.full_like(y, 0.9)])
+
+
+@pytest.mark.usefixtures("alone")
+def test_a_tracker_asks_for_landmarks_about_the_place_where_it_expects_the_person(walk: Path) -> None:
+    capture = replace(open_capture(walk), segmenter=Pose())
+    task, images = Task.of(capture, Settings()), np.zeros((len(capture.rig), HEIGHT // 2, WIDTH // 2, 3), np.uint8)
+    ask, points = landmark_asker(task), np.tile([0.2, 0.1, 1.0], (len(LANDMARKS), 1))
+    points[[LANDMARKS.index(f"shoulder_{side}") for side in "lr"], 2] = 1.4
+    assert ask is not None and sees_landmarks(task)
+    found = ask(images, points)
+    assert found is not None and found.shape == (len(capture.rig), len(LANDMARKS), 4)
+    middle = [camera.project(np.array([[0.2, 0.1, 1.0]]))[0][0] for camera in capture.rig]
+    assert np.linalg.norm(found[..., :2].mean(axis=1) - middle, axis=1).max() < 2.0
+    assert ask(images, np.full_like(points, np.nan)) is None
+
+
+@pytest.mark.usefixtures("alone")
+def test_who_is_asked_for_landmarks(walk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody without a network that sees them, or if the user says so, or if every frame has them."""
+    capture = open_capture(walk, masks="median")
+    assert landmark_asker(Task.of(capture, Settings())) is None
+    assert landmark_asker(Task.of(replace(capture, segmenter=Scarlet()), Settings())) is None
+    with_pose = replace(capture, segmenter=Pose())
+    for setting, asked in (("auto", True), ("never", False), ("always", False)):
+        assert (landmark_asker(Task.of(with_pose, Settings(landmarks=setting))) is not None) == asked
+    monkeypatch.setattr("tk.segmenters.names", lambda: ("mediapipe",))
+    for there in (True, False):  # nothing is downloaded for it
+        monkeypatch.setattr("tk.segmenters.weights.at_hand", lambda there=there: there)
+        assert (landmark_asker(Task.of(capture, Settings())) is not None) == there
 
 
 @pytest.mark.usefixtures("alone")

@@ -23,6 +23,7 @@ from tests.trackers.walker import BODY, NAMES, errors, observe
 from tk.model.body.limb_candidates import exchanged, pairs, turned
 from tk.model.body.skeleton import JOINTS
 from tk.model.cues.landmarks import NAME
+from tk.model.cues.landmarks import points as landmark_places
 
 
 def seen_at(pose: np.ndarray, noise_m: float = 0.03) -> np.ndarray:
@@ -159,3 +160,53 @@ def test_landmarks_decide_about_the_opposite_heading() -> None:
     assert tracker.headings([masks], POSES[:1], None, {NAME: seen_at(POSES[0])}) == ()
     both = [tracker.trajectory_cost([masks], pose[None], {NAME: seen_at(turned)}) for pose in (POSES[0], turned)]
     assert both[1] < both[0] - 10.0
+
+
+class Network:
+    """Answers with the landmarks of a pose, and counts how often it is asked."""
+
+    def __init__(self, pose: np.ndarray) -> None:
+        self.pose, self.asked = pose, 0
+        self.expected = np.empty(0)
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        self.asked, self.expected = self.asked + 1, points
+        return seen_at(self.pose, 0.01)[0]
+
+
+def test_network_is_asked_where_the_frame_leaves_a_limb_open() -> None:
+    """The left arm is in front of the trunk in most images, where silhouettes fit other poses of it as well."""
+    pose, wrist = with_arm(POSES[0], "l", (0.8, -0.2, -0.6), 70.0), JOINTS.index("wrist_l")
+    masks = draw_silhouettes(BODY, RIG, pose[None])[0]
+    network, found = Network(pose), {}
+    for name, ask in (("silhouettes", None), ("network", network)):
+        tracker = tracker_at(pose, masks, contours=replace(SETTINGS, search_every=0.2))
+        found[name] = [tracker.step(replace(observe(masks, i), ask=ask)) for i in range(3)]
+    assert network.asked == 1  # in the next frames it would say the same
+    shown = landmark_places(BODY, pose)
+    assert np.linalg.norm(network.expected - shown, axis=1).max() < CLOSE_M
+    before, after = (found[name][0].deviation for name in ("silhouettes", "network"))
+    assert before is not None and after is not None and after[wrist] < before[wrist] / 4
+    assert [e.landmarks is None for e in found["network"]] == [False, True, True]
+
+
+def test_network_is_not_asked_where_it_cannot_tell_more() -> None:
+    """The silhouettes show both arms and both legs."""
+    pose = with_arm(with_arm(POSES[0], "l", (0.0, 1.0, 0.0), 5.0), "r", (0.0, 1.0, 0.0), 5.0)
+    masks, network = draw_silhouettes(BODY, RIG, pose[None])[0], Network(pose)
+    tracker = tracker_at(pose, masks, contours=replace(SETTINGS, search_every=0.2))
+    tracker.step(observe(masks, 0))
+    found = [tracker.step(replace(observe(masks, i), ask=network)) for i in range(1, 4)]
+    assert [int(e.iterations[1]) for e in found] == [0, 0, 1]  # the limbs were searched for
+    assert network.asked == 0
+
+
+def test_answer_about_somebody_else_is_not_used() -> None:
+    pose = with_arm(POSES[0], "l", (0.8, -0.2, -0.6), 70.0)
+    masks, elsewhere = draw_silhouettes(BODY, RIG, pose[None])[0], pose.copy()
+    elsewhere[0] += 2.0
+    tracker, other = (tracker_at(pose, masks, contours=replace(SETTINGS, search_every=0.2)) for _ in range(2))
+    network = Network(elsewhere)
+    found = tracker.step(replace(observe(masks, 0), ask=network))
+    assert network.asked == 1 and found.landmarks is None
+    np.testing.assert_array_equal(found.pose, other.step(observe(masks, 0)).pose)

@@ -247,7 +247,7 @@ class Loop:
     def _step(self, observation: Frame) -> tuple[Estimate, ...] | None:
         """Step all trackers; return the estimates of the people in the result, None before the first frame to be
         written."""
-        if self._ask is not None:
+        if self._ask is not None and observation.images.size:
             observation = replace(observation, ask=partial(self._ask, observation.images))
         with one_thread():
             answers = self.people.step(observation)

@@ -18,7 +18,7 @@ from tk.model.masks.foreground import CollinearityForeground, Foreground
 from tk.model.masks.image_shift import exchanged_scenes
 from tk.run.learned_masks import MASK_SOURCES, LearnedMasks
 from tk.run.task import Task
-from tk.segmenters import INSTALL, at_hand, load, names
+from tk.segmenters import INSTALL, PoseSegmenter, at_hand, load, names
 from tk.threads import one_thread
 
 if TYPE_CHECKING:
@@ -107,16 +107,18 @@ def make_labeller(task: Task, note: Callable[[str], None]) -> Labeller:
 
 def sees_landmarks(task: Task) -> bool:
     """Return whether a network's landmarks are used in some frames."""
-    return task.settings.landmarks == "always" or _asked_for_landmarks(task) is not None
+    if task.settings.landmarks == "auto":
+        return bool(sources_of_masks(task.source)) or _asked_for_landmarks(task) is not None
+    return task.settings.landmarks == "always"
 
 
 def _asked_for_landmarks(task: Task) -> str | None:
     """Return the segmenter that trackers ask for landmarks: the one that makes the masks, or else one that is installed
-    with its weights. None: they ask none."""
-    if task.settings.landmarks == "never":
+    with its weights. None: they ask none, because there is none, or every frame has its landmarks."""
+    if task.settings.landmarks != "auto":
         return None
-    if task.source.segmenter is not None:
-        return type(task.source.segmenter).__name__
+    if (given := task.source.segmenter) is not None:
+        return type(given).__name__ if isinstance(given, PoseSegmenter) else None
     origin = mask_source(task.source)
     return origin.removeprefix(_SEGMENTER) if origin.startswith(_SEGMENTER) else at_hand()
 

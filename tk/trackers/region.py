@@ -311,20 +311,20 @@ class RegionTracker(ContourTracker[RegionState]):
         """Return whether a network tells more about the joints than a frame whose modes have a variance (J,), metres²:
         a landmark that is seen has a smaller error. Its answers in neighbouring frames are alike, so it is asked once
         between two routine searches."""
-        return self._since_asked >= self.search_frames and bool((variance > landmarks.deviation(1.0) ** 2).any())
+        return self._since_asked >= self.search_frames and bool((variance > landmarks.deviation(np.ones(1)) ** 2).any())
 
     def _ask(self, seen: Seen, pose: Float) -> Seen | None:
         """Return what a frame shows with a network's landmarks of the person, who is expected at a pose (D,); None if
         there is no network, the frame has its landmarks, or they show somebody else."""
         frame, pyramid = seen.frame, seen.pyramid
-        if frame.ask is None or frame.landmarks is not None or not frame.images.size:
+        if frame.ask is None or frame.landmarks is not None:
             return None
         self._since_asked = 0
         found = frame.ask(self.world.points_out(landmarks.points(self.body, pose)))
         marked = landmarks.of_person(None if found is None else found[None], pyramid.masks[0])
         if marked is None:
             return None
-        return self.see(frame, seen.images, replace(pyramid, measured=pyramid.measured | {landmarks.NAME: marked}))
+        return self.see(frame, seen.images, replace(pyramid, measured={**pyramid.measured, landmarks.NAME: marked}))
 
     def without_foreign(self, frame: Frame) -> Frame:
         """Return the frame with masks that exclude carried objects: large areas of colours that are not the person's.

@@ -106,13 +106,16 @@ class Tracks(NamedTuple):
 
     def of(self, rows: slice) -> Tracks:
         """Return some alternatives."""
-        return Tracks(*(values[rows] for values in self))
+        return Tracks(self.poses[rows], self.found[rows], self.cost[rows])
 
     def beside(self, other: Tracks) -> Tracks:
         """Return these alternatives, and in frames in which they are not found those of another direction."""
-        pairs = zip(self, other, strict=True)
-        shown = (np.where(self.found.reshape(self.found.shape + (1,) * (a.ndim - 2)), a, b) for a, b in pairs)
-        return Tracks(*shown)
+        own = self.found
+        return Tracks(
+            np.where(own[..., None], self.poses, other.poses),
+            own | other.found,
+            np.where(own, self.cost, other.cost),
+        )
 
 
 class SecondPass:

@@ -138,14 +138,17 @@ class Skeleton:
         return tuple(np.flatnonzero(depth == d) for d in range(depth.max() + 1))
 
     @cached_property
-    def _products(self) -> tuple[list[tuple[NDArray[np.int64], NDArray[np.int64]]], ...]:
+    def _products(self) -> tuple[list[tuple[NDArray[np.integer], NDArray[np.integer]]], ...]:
         """Rounds of products of transforms, each degrees of freedom and those above them by whose transforms they are
         multiplied: with the fewest products, and with the fewest rounds, in each of which the way up doubles."""
+        levels: list[tuple[NDArray[np.integer], NDArray[np.integer]]]
+        doubling: list[tuple[NDArray[np.integer], NDArray[np.integer]]]
+        levels = [(level, self.parent[level]) for level in self._levels[1:]]
         doubling, above = [], self.parent
         while (below := np.flatnonzero(above >= 0)).size:
             doubling.append((below, above[below]))
             above = np.where(above >= 0, above[above], -1)
-        return [(level, self.parent[level]) for level in self._levels[1:]], doubling
+        return levels, doubling
 
     @cached_property
     def _raised(self) -> NDArray[np.int64]:
