@@ -132,8 +132,8 @@ class Settings:
         resample: whether each frame's images are chosen by their time stamps, for cameras of different or variable
             rates. A frame for which a camera has no image within half an interval is blank in this camera.
         landmarks: in which frames a network's landmarks are used, see :mod:`tk.model.cues.landmarks`. "auto": those
-            that the network sees for its masks; "always": all, also with an empty scene or given masks (about a second
-            of processor time a frame set); "never": none.
+            that the network sees for its masks, and those in which the silhouettes leave a limb open, if a network is
+            installed with its weights; "always": all (about a second of processor time a frame set); "never": none.
         person_pixels: least height in pixels at which a person is tracked. The images of a camera that shows the person
             at n times this height are read at 1/n of their size; 0: all at full size. Measured: at 250 to 350 pixels
             limbs are as accurate as at 620; at 205 they are 0.1 cm worse, at 150 0.2 to 0.4 cm, at 100 0.5 to 3 cm.

@@ -175,7 +175,7 @@ _TRACKING_OPTIONS = (
     masks_option,
     click.option(
         "--landmarks", type=click.Choice(["auto", "always", "never"]),
-        help="Use the joints that a network sees: in the frames that it sees for its masks, in all, or in none.  "
+        help="Use the joints that a network sees: where silhouettes leave a limb open (auto), in all frames, or never.  "
         "[default: auto]",
     ),
     click.option("--body", type=PATH, metavar="FILE", help="Use the body of a result (.h5) or of a TOML file."),

@@ -31,7 +31,7 @@ def write_angles_csv(motion: Motion, path: Path) -> str | None:
         A note that names the angles that are blank in every frame.
     """
     meta = motion.result.meta
-    body = meta.pose_names, bool(meta.landmark_names)
+    body = meta.pose_names, motion.result.has_landmarks
     degrees = joint_angles(motion.rotations, motion.T_world_body, motion.segments, *body)
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream)

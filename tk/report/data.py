@@ -175,7 +175,7 @@ def _angles(result: Result, figure: Figure) -> list[dict[str, Any]]:
         base = joint.joint.removesuffix(side)
         for column, name in enumerate(joint.names):
             values = result.angles[joint.joint][:, column]
-            if joint.unmeasured and np.isnan(values).all():
+            if np.isnan(values).all():
                 continue
             title = f"{base} {name}".replace("_", " ")
             panel = panels.setdefault(

@@ -128,7 +128,7 @@ class _Finisher:
         body, poses = tracker.body.standing(setup.up), draft.current("pose")
         # poses of the first pass stay as they are
         kept = () if "pose" in draft.columns else ("pose", "joints/position")
-        seen = bool(draft.result.meta.landmark_names)
+        seen = draft.result.has_landmarks
         columns = draft.columns | {name: v for name, v in _columns(body, poses, seen).items() if name not in kept}
         filtered = smooth(body.skeleton, poses, ~draft.lost, setup.fps)
         smoothed = {**_columns(body, filtered.poses, seen), "bridged": filtered.bridged}

@@ -162,7 +162,7 @@ class PeopleMasks:
         person, cameras = self._empty(self._patches(place)), range(len(images))
         self._each(lambda c: self._segment(images, c, person), cameras)
         self._compare(images, person, cameras)
-        return person.landmarks
+        return np.asarray(associated(self._rig, person.landmarks[None])[0])
 
     def without_specks(self, masks: Images) -> Images:
         """Return masks (C, H, W) without small parts that no other camera shows: shadows, reflections."""

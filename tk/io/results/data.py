@@ -287,6 +287,11 @@ class Result:
         """Return (F,) True for frames in which the person is present and found; other frames have no usable pose."""
         return has_pose(self.status)
 
+    @property
+    def has_landmarks(self) -> bool:
+        """Whether a network's landmarks were used in a frame: only they show how far the head turns."""
+        return self.landmarks is not None and bool(np.isfinite(self.landmarks).any())
+
     def paper_pose(self) -> Float:
         """Return the pose vectors (F, 24) of Kehl & Van Gool's body: no waist, hip angles relative to the trunk.
 
