@@ -75,6 +75,7 @@ QUICK = """
 voxels = 32
 ahead = 0
 effort = 0.15
+landmarks = "never"
 [silhouette]
 init_frames = 3
 adapt = false
@@ -130,6 +131,14 @@ class Ran:
 
 
 Tk = Callable[..., Ran]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_network() -> Iterator[None]:
+    """Whatever is installed here, trackers ask no network for landmarks unless a test wants it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tk.segmenters.weights.at_hand", lambda: False)
+        yield
 
 
 @pytest.fixture
