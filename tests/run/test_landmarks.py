@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 
 from tests.conftest import Silent
 from tests.model.landmarks import landmarks_of
-from tests.run.test_source import BODY, ONE, POSES, RIG, SETUP, task
+from tests.run.test_source import BODY, ONE, POSES, RIG, SETTINGS, SETUP
 from tk.io.captures.frames import FrameSet
 from tk.io.results.reader import read_result
 from tk.model.body.body_points import LANDMARKS
@@ -19,6 +20,7 @@ from tk.run.learned_masks import LEARNED, SEGMENTER
 from tk.run.offline import REFINED
 from tk.run.segmentation import Labels
 from tk.run.session import track_task
+from tk.run.task import Task, TrackOptions
 
 ASKED = range(0, len(POSES), 2)  # frames that the network sees
 
@@ -57,9 +59,10 @@ class Stop(Silent):
 def test_result_has_the_landmarks_that_were_seen_and_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     """The second pass goes over frames of both runs."""
     whole, stopped = tmp_path / "whole.h5", tmp_path / "stopped.h5"
-    track_task(task(SETUP, ONE), whole, Silent())
-    assert track_task(task(SETUP, ONE), stopped, Stop()).interrupted and REFINED not in read_result(stopped).model
-    assert not track_task(task(SETUP, ONE), stopped, Silent(), resume=True).interrupted
+    options = TrackOptions(replace(SETTINGS, landmarks="auto"))
+    track_task(Task(SETUP, ONE, options), whole, Silent())
+    assert track_task(Task(SETUP, ONE, options), stopped, Stop()).interrupted and REFINED not in read_result(stopped).model
+    assert not track_task(Task(SETUP, ONE, options), stopped, Silent(), resume=True).interrupted
     result, found = read_result(whole), read_result(stopped)
     assert result.model[REFINED] == found.model[REFINED] == 1
     assert result.meta.landmark_names == LANDMARKS
