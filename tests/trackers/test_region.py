@@ -553,14 +553,32 @@ def test_second_pass_keeps_a_given_body() -> None:
 
 def test_legs_that_took_each_other_s_place_are_found_by_the_routine_search() -> None:
     pose = POSES[0]
-    tracker = tracker_at(pose, contours=replace(SETTINGS, search_every=1 / 3))
-    _, legs = pairs(tracker.limbs)
-    tracker.start_at(exchanged(pose, [legs])[0])
-    moved = [joint for leg in legs for joint in leg.joints]
-    steps = (tracker.step(observe(MASKS[0], 1 + i)) for i in range(tracker.search_frames))
-    off = [errors(step, pose)[moved] for step in steps]
-    assert off[0].max() > 0.2  # a descent alone does not exchange them
-    assert off[-1].max() < CLOSE_M
+    off = {}
+    for every in (0.0, 0.3):
+        tracker = tracker_at(pose, contours=replace(SETTINGS, search_every=every))
+        _, legs = pairs(tracker.limbs)
+        tracker.start_at(exchanged(pose, [legs])[0])
+        moved = [joint for leg in legs for joint in leg.joints]
+        off[every] = errors(tracker.step(observe(MASKS[0], 1)), pose)[moved].max()
+    assert off[0.0] > 0.2  # a descent alone does not exchange them
+    assert off[0.3] < CLOSE_M
+
+
+def test_routine_search_runs_at_intervals() -> None:
+    tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=1 / 3))
+    searched = [bool(tracker.step(observe(MASKS[0], i)).iterations[1]) for i in range(7)]
+    assert np.flatnonzero(searched).tolist() == [0, 5]
+
+
+def test_search_on_evidence_leaves_the_last_hypotheses_three_frames() -> None:
+    """An arm jumps up, and down again in the next frame."""
+    masks = draw_silhouettes(BODY, RIG, np.array([with_arm(POSES[0], "l", (0.1, 1.0, 0.6), 15.0)]))[0]
+    tracker = tracker_at(POSES[0], config=RegionSettings(false_alarm=0.4))
+    frames = [MASKS[0], masks, MASKS[0], MASKS[0], MASKS[0]]
+    estimates = [tracker.step(observe(shown, i)) for i, shown in enumerate(frames)]
+    assert [bool(e.iterations[1]) for e in estimates] == [False, True, False, False, True]
+    wrist = [errors(e, POSES[0])[JOINTS.index("wrist_l")] for e in estimates]
+    assert wrist[2] > 0.2 and wrist[4] < 0.06
 
 
 # --- the spread over the modes of a limb ------------------------------------------------------------------------------

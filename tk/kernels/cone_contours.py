@@ -83,17 +83,12 @@ def find_hider(parts: ti.template(), placed: ti.template(), b: int, candidates: 
     hidden, behind, depth = False, -1, 1e9 + 0.0 * ray[0]
     long = norm_sqr(ray)
     others = candidates
-    o = -1
     while not hidden and others != 0:
-        o += 1
-        this = others & 1
-        others >>= 1
-        close = False
-        if this == 1:
-            to = triple_in(placed, b, o, BALL) - eye
-            ahead = dot(to, ray)
-            close = ahead > 0.0 and norm_sqr(to) * long - ahead * ahead < placed[b, o, BALL_SQUARE] * long
-        if close:
+        o = ti.math.popcnt((others & -others) - 1)  # the lowest bit
+        others &= others - 1
+        to = triple_in(placed, b, o, BALL) - eye
+        ahead = dot(to, ray)
+        if ahead > 0.0 and norm_sqr(to) * long - ahead * ahead < placed[b, o, BALL_SQUARE] * long:
             R = load_rotation(placed, b, o)
             center = transposed_times(R, eye - load_translation(placed, b, o))
             t = enter(kind_of(parts, o), shape_of(parts, o), center, transposed_times(R, ray), HIDING_SHRINK)

@@ -98,16 +98,14 @@ class Edgels(NamedTuple):
 
 
 @ti.func
-def sample_curve(cameras: ti.template(), v: int, kind: int, shape, center, params, R, t, sign, u):
-    """Return a sample of a curve: the point in the part's frame, in the world, its pixel, the pixel's derivative, the
-    outward normal in the image, and whether that normal is defined."""
-    x_part, tangent = point_on(kind, shape, center, params, u)
-    x = times(R, x_part) + t
+def image_of(cameras: ti.template(), v: int, x, along, sign):
+    """Return the pixel of a sample x of a curve, the pixel's derivative, the outward normal in the image, and whether
+    that normal is defined; ``along``: the curve's tangent in the world."""
     pixel, J, _ = project(cameras, v, x)
-    along = times(J, times(R, tangent))
-    norm = norm2(along)
-    n = ti.Vector([along[1], -along[0]]) * (sign / ti.max(norm, 1e-9))
-    return x_part, x, pixel, J, n, norm > 1e-6
+    tangent = times(J, along)
+    norm = norm2(tangent)
+    n = ti.Vector([tangent[1], -tangent[0]]) * (sign / ti.max(norm, 1e-9))
+    return pixel, J, n, norm > 1e-6
 
 
 @ti.func
@@ -225,13 +223,14 @@ def search_contours(
             share = length / count
             for i in range(count):
                 u = (i + 0.5 + 0.0 * scale) / count
-                x_part, x, pixel, J, n, use = sample_curve(cameras, v, kind, shape, center, params, R, t, sign, u)
+                x_part, tangent = point_on(kind, shape, center, params, u)
+                x = times(R, x_part) + t
+                hidden, behind = find_hider(parts, placed, b, hiders[b, v, p], eye, x - eye)
+                if hidden:  # as many samples are
+                    continue
+                pixel, J, n, use = image_of(cameras, v, x, times(R, tangent), sign)
                 at = (pixel + 0.5) / scale - 0.5
                 use = use and in_picture(width, height, at)
-                behind = -1
-                if use:
-                    hidden, behind = find_hider(parts, placed, b, hiders[b, v, p], eye, x - eye)
-                    use = not hidden
                 found, d, weight = 0, 0.0 * scale, share
                 if use and behind >= 0 and numbers[INTERIOR] == 0.0:
                     # in front of another part no edge of the silhouette is expected, but a border of colours

@@ -75,6 +75,7 @@ MISPLACED = 0.25
 # limb has no contour to follow, and appears elsewhere. Where the pose explains the frame as well as others, nothing can
 # be found: the residual must be DOUBTFUL spreads above its mean.
 HIDDEN, SEARCH_HIDDEN, DOUBTFUL = 0.02, 2, 0.5
+_NEVER = -(2**31)  # the frame of the last limb search if there was none
 
 
 class _Look(NamedTuple):
@@ -101,6 +102,8 @@ class RegionState:
             (:class:`~tk.trackers.judgement.Match`), and with a high residual.
         view_m: see :class:`RegionTracker`.
         spread: (J,) variance of the joints' positions along an axis, metres², over the modes of the last limb search.
+        searched: the frame of that search; :data:`_NEVER` before the first one, and where the person has been found
+            anew.
         fresh: whether no frame has been tracked yet.
         since_asked: frames since a network was asked for landmarks.
     """
@@ -115,6 +118,7 @@ class RegionState:
     high_for: int
     view_m: float
     spread: Float
+    searched: int
     fresh: bool
     since_asked: int
 
@@ -163,6 +167,7 @@ class RegionTracker(ContourTracker[RegionState]):
         """Forget the residuals and everything that was decided from them."""
         self.residuals = ResidualBaseline(len(self.rig), self.config.false_alarm)
         self._lost_for = self._refused = self._high_for = 0
+        self._searched = _NEVER
 
     def start(self, frames: Sequence[Frame], subject: Subject) -> None:
         pose = self.find(frames, subject)
@@ -249,12 +254,13 @@ class RegionTracker(ContourTracker[RegionState]):
         # propose, settle, choose: the person anywhere, then the limbs
         cut = not self._lost_for and self.residuals.jumped(look.residual)
         if (cut or self._is_due(look.error)) and self._choose(seen, self.anywhere(seen, self._best.pose), again=True):
-            look = self._look(seen)
+            look, self._searched = self._look(seen), _NEVER
         misplaced = self.misplaced(evidence, look.label)
         searched = self._needs_search(frame, look, misplaced, evidence.hidden(look.label))
         best = self._best.pose
         self._since_asked += 1
         if searched:
+            self._searched = frame.index
             found = limbs.modes(self, seen, best, self.limbs if self._fresh else misplaced)
             if self._is_open(limbs.spread(self.body.skeleton, best, best, found)) and (asked := self._ask(seen, best)):
                 seen, found = asked, limbs.weighed(self, asked, best, found)
@@ -417,12 +423,15 @@ class RegionTracker(ContourTracker[RegionState]):
 
     def _needs_search(self, frame: Frame, look: _Look, misplaced: Sequence[Limb], hidden: float) -> bool:
         """Return whether the limbs are searched for: at intervals, if the residual is high, a limb is misplaced, or the
-        share ``hidden`` of the body meets pixels of other people and the frame shows what the pose does not explain."""
-        if misplaced or self.residuals.high(look.error):
+        share ``hidden`` of the body meets pixels of other people and the frame shows what the pose does not explain.
+
+        The poses that a search has proposed compete for :data:`RECOVER_EVERY` frames before the next search.
+        """
+        since, every = frame.index - self._searched, self.search_frames
+        if since >= RECOVER_EVERY and (misplaced or self.residuals.high(look.error)):
             return True
-        every = self.search_frames
         doubtful = hidden > HIDDEN and self.residuals.mean_excess(look.error) > DOUBTFUL
-        return every > 0 and (frame.index % every == 0 or (doubtful and frame.index % SEARCH_HIDDEN == 0))
+        return every > 0 and (since >= every or (doubtful and since >= SEARCH_HIDDEN))
 
     def _choose(self, seen: Seen, *proposed: Float, again: bool = False) -> bool:
         """Add proposed poses (B, D) to the hypotheses, with their cost relative to the best one's running mean; return

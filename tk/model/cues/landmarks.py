@@ -386,11 +386,13 @@ def propose(rig: Rig, body: ConeBody, seen: Float, p_near: Float) -> Float:
     start = figures(skeleton, p_near)
     prior = Quadratic.about(start, np.where(skeleton.prismatic, 1.0, np.pi) ** -2.0)
     poses = start
-    for widened in np.repeat(WIDENED, 2):
-        cost = LandmarkCue(rig, body, seen, widened).normal(poses) + prior
-        step = np.linalg.solve(cost.matrix, cost.linear[..., None])[..., 0] - poses
-        poses = skeleton.clip(poses + np.clip(step, -LONGEST_STEP, LONGEST_STEP))
-    return np.asarray(poses[np.argsort(LandmarkCue(rig, body, seen).cost(poses), kind="stable")])
+    for widened in WIDENED:
+        cue = LandmarkCue(rig, body, seen, widened)
+        for _ in range(2):
+            cost = cue.normal(poses) + prior
+            step = np.linalg.solve(cost.matrix, cost.linear[..., None])[..., 0] - poses
+            poses = skeleton.clip(poses + np.clip(step, -LONGEST_STEP, LONGEST_STEP))
+    return np.asarray(poses[np.argsort(cue.cost(poses), kind="stable")])
 
 
 def points(body: ConeBody, pose: Float) -> Float:
