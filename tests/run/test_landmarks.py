@@ -61,7 +61,8 @@ def test_result_has_the_landmarks_that_were_seen_and_a_resumed_run_equals_an_uni
     whole, stopped = tmp_path / "whole.h5", tmp_path / "stopped.h5"
     options = TrackOptions(replace(SETTINGS, landmarks="auto"))
     track_task(Task(SETUP, ONE, options), whole, Silent())
-    assert track_task(Task(SETUP, ONE, options), stopped, Stop()).interrupted and REFINED not in read_result(stopped).model
+    assert track_task(Task(SETUP, ONE, options), stopped, Stop()).interrupted
+    assert REFINED not in read_result(stopped).model
     assert not track_task(Task(SETUP, ONE, options), stopped, Silent(), resume=True).interrupted
     result, found = read_result(whole), read_result(stopped)
     assert result.model[REFINED] == found.model[REFINED] == 1

@@ -175,8 +175,8 @@ _TRACKING_OPTIONS = (
     masks_option,
     click.option(
         "--landmarks", type=click.Choice(["auto", "always", "never"]),
-        help="Use the joints that a network sees: where silhouettes leave a limb open (auto), in all frames, or never.  "
-        "[default: auto]",
+        help="Use the joints that a network sees: auto: where silhouettes leave a limb open; always: in all frames; "
+        "never.  [default: auto]",
     ),
     click.option("--body", type=PATH, metavar="FILE", help="Use the body of a result (.h5) or of a TOML file."),
     click.option(
