@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import reduce
+from itertools import zip_longest
 from operator import add
 from typing import Any
 
@@ -119,6 +120,7 @@ class ContourFinder:
         skeleton = build_skeleton(AVERAGE_BODY)
         self.pose_names, self.pose_units = skeleton.names, skeleton.units
         self._body: ConeBody | None = None
+        self._cues: tuple[tuple[object, ...], list[Cue]] = ((None,), [])  # the last ones, and what they are of
         self.colors: PartColors
         self.limbs: tuple[Limb, ...]
 
@@ -302,9 +304,12 @@ class ContourFinder:
         return RenderedBody(met.label[0], met.depth[0])
 
     def cues(self, pyramid: Pyramid) -> list[Cue]:
-        """Return what a frame, or each of B frames, shows beside silhouettes."""
-        rig, measured = self.views.rig, pyramid.measured
-        return [of(rig, self.body, measured[name]) for name, of in CUES.items() if name in measured]
+        """Return what a frame, or each of B frames, shows beside silhouettes; a frame's are asked for ten times."""
+        of_these = self.views.rig, self.body, pyramid.measured
+        if any(new is not old for new, old in zip_longest(of_these, self._cues[0])):
+            rig, body, measured = of_these
+            self._cues = of_these, [of(rig, body, measured[name]) for name, of in CUES.items() if name in measured]
+        return self._cues[1]
 
     def contradiction(self, pyramid: Pyramid, poses: Float) -> Float:
         """Return (B, J) variance of the joints' positions, metres², by which the cues contradict poses (B, D)."""

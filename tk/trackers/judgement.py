@@ -48,6 +48,7 @@ Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 # Frames between two searches for a lost person; a residual that stays high starts them after 1, 2, 4 … times as many.
+# Also between two searches for a limb that stays misplaced.
 RECOVER_EVERY = 3
 # Sigma is unknown after this many consecutive frames with a high residual: two searches have failed.
 UNKNOWN_AFTER = 2 * RECOVER_EVERY

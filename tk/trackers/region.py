@@ -425,10 +425,11 @@ class RegionTracker(ContourTracker[RegionState]):
         """Return whether the limbs are searched for: at intervals, if the residual is high, a limb is misplaced, or the
         share ``hidden`` of the body meets pixels of other people and the frame shows what the pose does not explain.
 
-        The poses that a search has proposed compete for :data:`RECOVER_EVERY` frames before the next search.
+        The poses that a search has proposed compete for :data:`RECOVER_EVERY` frames before a limb that is still
+        misplaced is searched for again.
         """
         since, every = frame.index - self._searched, self.search_frames
-        if since >= RECOVER_EVERY and (misplaced or self.residuals.high(look.error)):
+        if self.residuals.high(look.error) or (misplaced and since >= RECOVER_EVERY):
             return True
         doubtful = hidden > HIDDEN and self.residuals.mean_excess(look.error) > DOUBTFUL
         return every > 0 and (since >= every or (doubtful and since >= SEARCH_HIDDEN))
