@@ -218,22 +218,26 @@ class Ahead:
     """Observations that a separate process makes. It starts at once and learns the background.
 
     The arrays of a frame stay as they are while they are referenced; then their slot is used again. For each frame that
-    it receives, the tracker gives the process a free slot, so the process always has ``settings.ahead`` of them.
+    it receives, the tracker gives the process a free slot, so the process always has ``settings.ahead`` of them. It
+    begins with one for each frame of the opening, because the tracker begins when it has all of these.
     """
 
     def __init__(self, task: Task, note: Note, image_step: int = 1, film: Film | None = None) -> None:
         self._where, self._note = task.source.where, note
         self._layout = _Layout(task.setup.rig, image_step)
-        slots = max(min(task.settings.ahead, _AHEAD_BYTES // self._layout.bytes), 1)
+        most = max(_AHEAD_BYTES // self._layout.bytes, 1)
+        slots = max(min(task.settings.ahead, most), 1)
+        first = max(min(task.settings.silhouette.init_frames, most, slots + _SPARE - _HELD), slots)
         size = (slots + _SPARE) * self._layout.bytes  # the system provides memory where it is written
         memory = NamelessFile.in_memory(size)
         self._memory = memory.map()
-        self._free = list(range(slots, slots + _SPARE))
+        self._free = list(range(first, slots + _SPARE))
+        self._given = first - slots  # slots that the process has in advance
         self._dropped: deque[int] = deque()  # slots of frames that are no longer referenced
         self._begun = False
         child = worker.take()
         self._process, self._channel = child.process, child.channel
-        self._send(_Order(task, image_step, slots, memory, film))
+        self._send(_Order(task, image_step, first, memory, film))
 
     def frames(self, start: int, stop: int | None) -> Iterator[Observed]:
         self._begun = True
@@ -257,7 +261,10 @@ class Ahead:
         if self._free:
             # every view has this array for its base, so it goes with the last of them
             weakref.finalize(slot, self._dropped.append, ready.slot).atexit = False
-            self._send(self._free.pop())
+            if self._given:
+                self._given -= 1
+            else:
+                self._send(self._free.pop())
         else:
             slot = slot.copy()
             self._send(ready.slot)
