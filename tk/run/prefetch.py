@@ -14,6 +14,7 @@ and the process ends, too. The frames equal those of :class:`Serial` bit for bit
 from __future__ import annotations
 
 import contextlib
+import importlib
 import math
 import mmap
 import pickle
@@ -37,7 +38,7 @@ from tk.io.captures.film import Film
 from tk.kernels.runtime import ensure_runtime
 from tk.model.cameras.camera import Rig
 from tk.run import worker
-from tk.run.segmentation import Labeller, make_labeller, mask_source, prepare_kernels
+from tk.run.segmentation import make_labeller, mask_source, prepare_kernels
 from tk.run.task import Task
 from tk.segmenters import Segmenter
 from tk.system import machine, signals
@@ -117,11 +118,12 @@ def _can_be_sent(segmenter: Segmenter | None) -> bool:
 
 
 def observe(
-    task: Task, label: Labeller, note: Note, span: tuple[int, int | None], image_step: int, film: Film | None
+    task: Task, note: Note, span: tuple[int, int | None], image_step: int, film: Film | None
 ) -> Iterator[tuple[Frame, Stopwatch]]:
     """Decode and segment frames in this process; ``span``: first frame, and the end, exclusive."""
     shapes = [(camera.height, camera.width) for camera in task.setup.rig]
     with task.source.frames(*span) as frames:
+        label = make_labeller(task, note)  # threads decode the first frames meanwhile
         while True:
             watch = Stopwatch()
             frame = next(frames, None)
@@ -149,9 +151,7 @@ class Serial:
     film: Film | None = None
 
     def frames(self, start: int, stop: int | None) -> Iterator[Observed]:
-        label = make_labeller(self.task, self.note)
-        span = start, stop
-        for observation, watch in observe(self.task, label, self.note, span, self.image_step, self.film):
+        for observation, watch in observe(self.task, self.note, (start, stop), self.image_step, self.film):
             yield observation, {**watch.laps, "wait": sum(watch.laps.values())}
 
     def __enter__(self) -> Serial:
@@ -215,7 +215,7 @@ class _Layout:
 
 
 class Ahead:
-    """Observations that a separate process makes. It starts at once and learns the background.
+    """Observations that a separate process makes.
 
     The arrays of a frame stay as they are while they are referenced; then their slot is used again. For each frame that
     it receives, the tracker gives the process a free slot, so the process always has ``settings.ahead`` of them. It
@@ -367,8 +367,9 @@ def serve() -> None:
 
 
 def _warm_up(tracker: Channel) -> None:
-    """Compile the kernels of the masks until the task arrives: the tracker's process imports meanwhile."""
-    for step in (ensure_runtime, prepare_kernels):
+    """Compile the kernels of the masks, and import PyAV, until the task arrives: the tracker's process imports
+    meanwhile."""
+    for step in (ensure_runtime, prepare_kernels, lambda: importlib.import_module("av")):
         if tracker.waiting():
             return
         step()
@@ -376,9 +377,8 @@ def _warm_up(tracker: Channel) -> None:
 
 def _serve(tracker: Channel) -> None:
     order: _Order = tracker.receive()
-    label = make_labeller(order.task, tracker.send)
     slots = _Slots(tracker, order)
     span: tuple[int, int | None] = tracker.receive()
-    for observation, watch in observe(order.task, label, tracker.send, span, order.image_step, order.film):
+    for observation, watch in observe(order.task, tracker.send, span, order.image_step, order.film):
         slots.put(observation, watch)
     tracker.send(None)
