@@ -99,8 +99,8 @@ class _Span:
 
 @dataclass(frozen=True)
 class _Part:
-    """Frames ``begin`` to ``stop``, exclusive, whose scene is learned from some samples; without any, the segmenter makes
-    all masks."""
+    """Frames ``begin`` to ``stop``, exclusive, whose scene is learned from these samples; without any, the segmenter
+    makes all masks."""
 
     begin: int
     stop: int
