@@ -85,11 +85,26 @@ def test_a_note_says_why_the_segmenter_makes_all_masks(folder: Path) -> None:
     assert "images are too large" in said[-1]
 
 
-def test_masks_do_not_depend_on_the_first_frame(folder: Path) -> None:
-    whole, part = (labels_of(capture_of(folder)[0], start) for start in (0, 37))
-    for a, b in zip(whole[37:], part, strict=True):
+@pytest.mark.parametrize("fps", [15.0, 10.0])  # 8 and 9 samples: with 9 the opening has its own scene
+@pytest.mark.parametrize("start", [10, 37])
+def test_masks_do_not_depend_on_the_first_frame(folder: Path, fps: float, start: int) -> None:
+    capture = replace(capture_of(folder)[0], fps=fps)
+    whole, part = (labels_of(capture, first) for first in (0, start))
+    for a, b in zip(whole[start:], part, strict=True):
         for one, other in zip(a, b, strict=True):
             np.testing.assert_array_equal(one, other)
+
+
+def test_opening_waits_for_eight_samples_only(folder: Path) -> None:
+    capture, segmenter = capture_of(folder)
+    capture, asked = replace(capture, fps=10.0), []  # nine samples
+    task = Task.of(capture, Settings())
+    label, opening = make_labeller(task, lambda _: None), task.settings.silhouette.init_frames
+    with capture.frames() as frames:
+        for frame in frames:
+            label(frame)
+            asked.append(segmenter.asked[0])
+    assert asked[0] == asked[opening - 1] < asked[opening] == asked[-1]
 
 
 def test_first_frame_waits_for_no_check_of_later_samples(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

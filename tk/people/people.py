@@ -95,6 +95,7 @@ class People:
         self._given: set[int] | None = None
         #: why nobody is tracked yet; empty before the first frame
         self.refusal = ""
+        self._located: tuple[Frame, tuple[LocatedPerson, ...]] | None = None  # before :meth:`start`
         tracker = sharing(first)
         self._grid: RayGrid | None = None if tracker is None else tracker.fine_grid
 
@@ -131,6 +132,12 @@ class People:
 
     # --- the first frames ---------------------------------------------------------------------------------------------
 
+    def locate(self, frame: Frame) -> tuple[LocatedPerson, ...]:
+        """Return the people in a frame. :meth:`start` asks for those in its first frame, and takes them from here."""
+        if self._located is None or self._located[0] is not frame:
+            self._located = frame, self._finder.find(frame.masks, frame.uncertain)
+        return self._located[1]
+
     def start(self, opening: Sequence[Frame], given_masks: bool = False) -> bool:
         """Find the people in the first frame, and start a tracker for everybody in the volume.
 
@@ -144,7 +151,7 @@ class People:
             CaptureError: in the first call, too few cameras see the person, or the masks do not belong to the images.
         """
         frame, subjects = opening[0], self._setup.subjects
-        found = self._finder.find(frame.masks, frame.uncertain)
+        found, self._located = self.locate(frame), None
         if not any(s.init for s in subjects) and self._finder.is_empty(frame.masks, found):
             if not self.refusal:
                 _LOG.info("waiting: nobody stands in the working volume in frame %d", frame.index)

@@ -7,6 +7,9 @@ scene is unknown, the segmenter's masks before and after the frame decide; where
 asked frames are also a check: around one in which the segmentation disagrees, the segmenter makes all masks between the
 asked frames before and after it.
 
+The first pose needs the masks of the opening. Their scene is learned from the first eight asked frames only, so that
+they need not wait for the others of the span.
+
 The masks of a frame depend on the recording alone, so `--resume` and `--frames` see the same masks. In a source of
 unknown length the scene is learned from the frames asked for so far; until they are enough, the segmenter makes all
 masks.
@@ -94,6 +97,16 @@ class _Span:
         return self.samples[after if exact else after - 1], self.samples[after]
 
 
+@dataclass(frozen=True)
+class _Part:
+    """Frames ``begin`` to ``stop``, exclusive, whose scene is learned from these samples; without any, the segmenter
+    makes all masks."""
+
+    begin: int
+    stop: int
+    samples: tuple[int, ...]
+
+
 class LearnedMasks:
     """Segments the people in the frames of a recording, best in order."""
 
@@ -102,17 +115,18 @@ class LearnedMasks:
         self._source, self._settings, self._people = source, task.settings, people
         self._sizes = [(camera.width, camera.height) for camera in setup.rig]
         self._fps, self._cameras = setup.fps, len(setup.rig)
-        self._edges = _edges(source.first_frame, source.frame_count, setup.fps)
+        self._parts = self._divided(task.settings.silhouette.init_frames)
         self._span = _Span(0, 0, None, ())
+        self._taken: dict[int, tuple[Masks, Segmented]] = {}  # samples of the span: images, and what is seen in them
+        self._coming: Sequence[int] = ()  # the samples that are read next
         self._reading: Iterator[FrameSet] = iter(())
-        self._next = -1
         self._open = ExitStack()
         self._past: deque[tuple[Masks, _Asked]] = deque(maxlen=_PAST)
         self._asked = 0
 
     def why_throughout(self) -> str | None:
         """Return why the segmenter makes all masks of a recording; None if it makes some of them."""
-        if len(self._edges) < 2 or self._chosen(*self._edges[:2]):
+        if not self._parts or self._parts[0].samples:
             return None
         if self._most_samples < _LEAST:
             return "the images are too large to keep samples of the scene"
@@ -147,41 +161,55 @@ class LearnedMasks:
         """Ask for a frame that is no sample; people are expected where the sample before it shows them."""
         return self._people.label(frame.images, (near and near.seen.places) or (), frame.index)
 
+    def _divided(self, opening: int) -> list[_Part]:
+        """Return the parts of the recording: its spans, of which the first begins with the frames of the opening."""
+        edges = _edges(self._source.first_frame, self._source.frame_count, self._fps)
+        parts = [_Part(begin, stop, self._chosen(begin, stop)) for begin, stop in pairwise(edges)]
+        first = parts[0] if parts else _Part(0, 0, ())
+        if len(first.samples) > _LEAST and (end := first.begin + opening) < first.stop:
+            parts[:1] = [_Part(first.begin, end, first.samples[:_LEAST]), _Part(end, first.stop, first.samples)]
+        return parts
+
     def _span_of(self, index: int) -> _Span:
-        within = min(max(index, self._edges[0]), self._edges[-1] - 1)
+        within = min(max(index, self._parts[0].begin), self._parts[-1].stop - 1)
         if not self._span.begin <= within < self._span.stop:
-            k = bisect_right(self._edges, within)
-            self._span = self._learn(self._edges[k - 1], self._edges[k])
+            k = bisect_right(self._parts, within, key=lambda part: part.begin)
+            self._span = self._learn(self._parts[k - 1], *self._parts[k : k + 1])
         return self._span
 
-    def _learn(self, begin: int, stop: int) -> _Span:
-        """Ask for the masks of a span's samples and learn its scene."""
-        images: dict[int, Masks] = {}
-        samples: list[_Asked] = []
-        chosen = set(self._chosen(begin, stop))
-        if not chosen:
-            return _Span(begin, stop, None, ())
-        if self._next != begin:
-            self._open.close()
-            self._reading = self._open.enter_context(self._samples_from(begin))
-        for frame in self._reading:
-            if frame.index in chosen:
-                images[frame.index] = frame.images.copy()
-                seen = self._next_sample(frame.images, [seen for _, seen in samples], len(samples))
-                samples.append((frame.index, seen))
-            if frame.index + 1 >= stop:
-                break
-        self._next = stop
-        foreground = self._foreground(list(images.values()), samples)
-        return _Span(begin, stop, foreground, tuple(_checked(foreground, images, each) for each in samples))
+    def _learn(self, part: _Part, following: _Part | None = None) -> _Span:
+        """Ask for the masks of a part's samples and learn its scene. ``following``: the part after it, if any."""
+        if not part.samples:
+            return _Span(part.begin, part.stop, None, ())
+        self._take(part.samples)
+        images, seen = zip(*self._taken.values(), strict=True)
+        samples = list(zip(part.samples, seen, strict=True))
+        foreground = self._foreground(images, samples)
+        kept = dict(zip(part.samples, images, strict=True))
+        if following is None or part.samples[0] not in following.samples:
+            self._taken = {}  # images are large, and a check is the last to need them
+        return _Span(part.begin, part.stop, foreground, tuple(_checked(foreground, kept, each) for each in samples))
 
-    def _samples_from(self, begin: int) -> AbstractContextManager[Iterator[FrameSet]]:
-        """Return the samples of the spans from frame ``begin`` on; with all frames between them if the source cannot
-        leave them out."""
+    def _take(self, samples: tuple[int, ...]) -> None:
+        """Ask for the masks of samples; of those that the part before has begun with, for the others."""
+        self._taken = {k: self._taken[k] for k in samples if k in self._taken}
+        missing = samples[len(self._taken) :]
+        if missing and (not self._coming or self._coming[0] != missing[0]):
+            self._open.close()
+            following = {k for part in self._parts for k in part.samples if k >= missing[0]}
+            self._coming = sorted(following)
+            self._reading = self._open.enter_context(self._frames_of(self._coming))
+        for index in missing:
+            frame = next(frame for frame in self._reading if frame.index == index)
+            seen = self._next_sample(frame.images, [seen for _, seen in self._taken.values()], len(self._taken))
+            self._taken[index] = frame.images.copy(), seen
+        self._coming = self._coming[len(missing) :]
+
+    def _frames_of(self, samples: Sequence[int]) -> AbstractContextManager[Iterator[FrameSet]]:
+        """Return the frames of samples; with all frames between them if the source cannot leave them out."""
         if not isinstance(self._source, Capture):
-            return self._source.frames(begin, self._source.frame_count)
-        spans = pairwise(self._edges[bisect_left(self._edges, begin) :])
-        return self._source.some_frames([index for span in spans for index in self._chosen(*span)])
+            return self._source.frames(samples[0], self._source.frame_count)
+        return self._source.some_frames(samples)
 
     def _next_sample(self, images: Masks, before: Sequence[Segmented], turn: int) -> Segmented:
         """Ask for a sample after others: the people of the last one are expected to have moved on. ``turn``: number of
@@ -209,15 +237,15 @@ class LearnedMasks:
         scene = LearnedScene.learn(images, [s.masks for _, s in samples], [s.uncertain for _, s in samples])
         return CollinearityForeground.of_learned(scene, self._sizes, self._settings.foreground)
 
-    def _chosen(self, begin: int, stop: int) -> list[int]:
+    def _chosen(self, begin: int, stop: int) -> tuple[int, ...]:
         """Return the frames of a span that the segmenter is asked for; none if they would be too many or too few."""
         frames = stop - begin
         most = min(_SHARE * frames, self._most_samples)
         count = int(min(max(frames / self._fps / _STEP_S, _LEAST), most))
         if count < _LEAST:
-            return []
+            return ()
         # both ends, because unknown pixels between two samples are safer than beyond the outermost
-        return [begin + (frames - 1) * k // (count - 1) for k in range(count)]
+        return tuple(begin + (frames - 1) * k // (count - 1) for k in range(count))
 
 
 def _checked(foreground: CollinearityForeground | None, images: dict[int, Masks], asked: _Asked) -> _Sample:

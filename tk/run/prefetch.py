@@ -14,6 +14,7 @@ and the process ends, too. The frames equal those of :class:`Serial` bit for bit
 from __future__ import annotations
 
 import contextlib
+import importlib
 import math
 import mmap
 import pickle
@@ -37,7 +38,7 @@ from tk.io.captures.film import Film
 from tk.kernels.runtime import ensure_runtime
 from tk.model.cameras.camera import Rig
 from tk.run import worker
-from tk.run.segmentation import Labeller, make_labeller, mask_source, prepare_kernels
+from tk.run.segmentation import make_labeller, mask_source, prepare_kernels
 from tk.run.task import Task
 from tk.segmenters import Segmenter
 from tk.system import machine, signals
@@ -117,11 +118,12 @@ def _can_be_sent(segmenter: Segmenter | None) -> bool:
 
 
 def observe(
-    task: Task, label: Labeller, note: Note, span: tuple[int, int | None], image_step: int, film: Film | None
+    task: Task, note: Note, span: tuple[int, int | None], image_step: int, film: Film | None
 ) -> Iterator[tuple[Frame, Stopwatch]]:
     """Decode and segment frames in this process; ``span``: first frame, and the end, exclusive."""
     shapes = [(camera.height, camera.width) for camera in task.setup.rig]
     with task.source.frames(*span) as frames:
+        label = make_labeller(task, note)  # threads decode the first frames meanwhile
         while True:
             watch = Stopwatch()
             frame = next(frames, None)
@@ -149,9 +151,7 @@ class Serial:
     film: Film | None = None
 
     def frames(self, start: int, stop: int | None) -> Iterator[Observed]:
-        label = make_labeller(self.task, self.note)
-        span = start, stop
-        for observation, watch in observe(self.task, label, self.note, span, self.image_step, self.film):
+        for observation, watch in observe(self.task, self.note, (start, stop), self.image_step, self.film):
             yield observation, {**watch.laps, "wait": sum(watch.laps.values())}
 
     def __enter__(self) -> Serial:
@@ -215,25 +215,29 @@ class _Layout:
 
 
 class Ahead:
-    """Observations that a separate process makes. It starts at once and learns the background.
+    """Observations that a separate process makes.
 
     The arrays of a frame stay as they are while they are referenced; then their slot is used again. For each frame that
-    it receives, the tracker gives the process a free slot, so the process always has ``settings.ahead`` of them.
+    it receives, the tracker gives the process a free slot, so the process always has ``settings.ahead`` of them. It
+    begins with one for each frame of the opening, because the tracker begins when it has all of these.
     """
 
     def __init__(self, task: Task, note: Note, image_step: int = 1, film: Film | None = None) -> None:
         self._where, self._note = task.source.where, note
         self._layout = _Layout(task.setup.rig, image_step)
-        slots = max(min(task.settings.ahead, _AHEAD_BYTES // self._layout.bytes), 1)
+        most = max(_AHEAD_BYTES // self._layout.bytes, 1)
+        slots = max(min(task.settings.ahead, most), 1)
+        first = max(min(task.settings.silhouette.init_frames, most, slots + _SPARE - _HELD), slots)
         size = (slots + _SPARE) * self._layout.bytes  # the system provides memory where it is written
         memory = NamelessFile.in_memory(size)
         self._memory = memory.map()
-        self._free = list(range(slots, slots + _SPARE))
+        self._free = list(range(first, slots + _SPARE))
+        self._given = first - slots  # slots that the process has in advance
         self._dropped: deque[int] = deque()  # slots of frames that are no longer referenced
         self._begun = False
         child = worker.take()
         self._process, self._channel = child.process, child.channel
-        self._send(_Order(task, image_step, slots, memory, film))
+        self._send(_Order(task, image_step, first, memory, film))
 
     def frames(self, start: int, stop: int | None) -> Iterator[Observed]:
         self._begun = True
@@ -257,7 +261,10 @@ class Ahead:
         if self._free:
             # every view has this array for its base, so it goes with the last of them
             weakref.finalize(slot, self._dropped.append, ready.slot).atexit = False
-            self._send(self._free.pop())
+            if self._given:
+                self._given -= 1
+            else:
+                self._send(self._free.pop())
         else:
             slot = slot.copy()
             self._send(ready.slot)
@@ -360,8 +367,9 @@ def serve() -> None:
 
 
 def _warm_up(tracker: Channel) -> None:
-    """Compile the kernels of the masks until the task arrives: the tracker's process imports meanwhile."""
-    for step in (ensure_runtime, prepare_kernels):
+    """Compile the kernels of the masks, and import PyAV, until the task arrives: the tracker's process imports
+    meanwhile."""
+    for step in (ensure_runtime, prepare_kernels, lambda: importlib.import_module("av")):
         if tracker.waiting():
             return
         step()
@@ -369,9 +377,8 @@ def _warm_up(tracker: Channel) -> None:
 
 def _serve(tracker: Channel) -> None:
     order: _Order = tracker.receive()
-    label = make_labeller(order.task, tracker.send)
     slots = _Slots(tracker, order)
     span: tuple[int, int | None] = tracker.receive()
-    for observation, watch in observe(order.task, label, tracker.send, span, order.image_step, order.film):
+    for observation, watch in observe(order.task, tracker.send, span, order.image_step, order.film):
         slots.put(observation, watch)
     tracker.send(None)

@@ -6,8 +6,10 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
-from importlib.metadata import entry_points
+import sys
+from importlib.metadata import EntryPoints, entry_points
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
@@ -66,9 +68,15 @@ class PoseSegmenter(Protocol):
         ...
 
 
+@functools.lru_cache(1)
+def _entries(path: tuple[str, ...]) -> EntryPoints:
+    """Return the segmenters of other packages. It takes 20 ms: the files of all packages in ``path`` are read."""
+    return entry_points(group=GROUP)
+
+
 def names() -> tuple[str, ...]:
     """Return the installed segmenters; those of other packages first, because the user chose to install them."""
-    others = sorted({entry.name for entry in entry_points(group=GROUP)})
+    others = sorted({entry.name for entry in _entries(tuple(sys.path))})
     built_in = [_BUILT_IN] if importlib.util.find_spec("ai_edge_litert") else []
     return (*others, *built_in)
 
@@ -90,7 +98,7 @@ def load(name: str) -> Segmenter:
     Raises:
         ConfigError: it is not installed, or cannot be loaded.
     """
-    for entry in entry_points(group=GROUP):
+    for entry in _entries(tuple(sys.path)):
         if entry.name == name:
             try:
                 made: Segmenter = entry.load()()

@@ -222,7 +222,7 @@ def test_images_are_turned_as_the_file_asks(tmp_path: Path, turn: int) -> None:
     size = (HEIGHT, WIDTH) if turn % 180 else (WIDTH, HEIGHT)
     assert (clip.width, clip.height, clip.turn, clip.by_opencv) == (*size, turn, True)
     out = np.zeros((clip.height, clip.width, 3), np.uint8)
-    for each in (clip, dataclasses.replace(clip, by_opencv=False)):
+    for each in (clip, dataclasses.replace(clip, first=None)):
         with closing(each.open()) as reader:
             reader.skip()
             reader.read(out)

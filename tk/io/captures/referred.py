@@ -125,7 +125,7 @@ def open_video_files(paths: Sequence[Path], size: tuple[int, int] | None = None)
     """
     clips: list[Clip] = []
     for path in paths:
-        clip = replace(probe_video(path), by_opencv=False)
+        clip = replace(probe_video(path), first=None)
         clips.append(clip if size is None else as_calibrated(clip, size))
     return clips[0] if len(clips) == 1 else Chapters.of(clips)
 

@@ -1,11 +1,13 @@
 """Clips that are video files.
 
 OpenCV decodes them. PyAV decodes images that are reduced before they become BGR, and those that OpenCV gets wrong:
-interlaced ones, files whose packets are not all images, and files of which the first images differ.
+interlaced ones, files whose packets are not all images, and files of which the first images differ. These are compared
+when OpenCV is to decode the file.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -41,6 +43,30 @@ _WITHOUT_INDEX = ("mpegts", "mpeg")  # FFmpeg's names of containers
 
 
 @dataclass(frozen=True)
+class FirstImages:
+    """The first images of a file, as PyAV decodes them.
+
+    Attributes:
+        count: number of them.
+        last: every :data:`_EVERY`-th pixel of the last one, BGR.
+        differ: whether it differs from the first.
+        size: width and height, pixels.
+    """
+
+    count: int
+    last: Image
+    differ: bool
+    size: tuple[int, int]
+
+    @classmethod
+    def of(cls, contents: Contents) -> FirstImages:
+        whole = as_bgr(contents.first[-1], contents.turn // 90)
+        planes = [bytes(image.planes[0]) for image in contents.first]
+        last = np.ascontiguousarray(whole[::_EVERY, ::_EVERY])
+        return cls(len(planes), last, planes[0] != planes[-1], (contents.width, contents.height))
+
+
+@dataclass(frozen=True)
 class VideoClip(Clip):
     """A video file; made by :func:`probe_video`.
 
@@ -48,7 +74,7 @@ class VideoClip(Clip):
         turn: degrees, counter-clockwise, by which the file asks players to turn its images: 0, 90, 180 or 270.
         interlaced: whether images are marked as interlaced.
         undecodable: number of coded images before the first one that can be decoded.
-        by_opencv: whether OpenCV decodes it; else PyAV.
+        first: what OpenCV has to decode; None: PyAV decodes the file.
         as_coded: whether the images are not turned.
         planar: whether the images consist of a plane of brightness and two planes of colours, 8 or 10 bits.
         keys: (K,) numbers of the images from which decoding can begin, increasing; none without times.
@@ -57,18 +83,23 @@ class VideoClip(Clip):
     turn: int = 0
     interlaced: bool = False
     undecodable: int = 0
-    by_opencv: bool = True
+    first: FirstImages | None = field(default=None, compare=False, repr=False)
     as_coded: bool = False
     planar: bool = False
     keys: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64), compare=False, repr=False)
 
     def open(self) -> Reader:
-        return _OpenCVReader(self) if self.by_opencv and not self.by_planes else _PyAVReader(self)
+        return _OpenCVReader(self) if not self.by_planes and self.by_opencv else _PyAVReader(self)
+
+    @functools.cached_property
+    def by_opencv(self) -> bool:
+        """Whether OpenCV decodes the file, unless :attr:`by_planes`; else PyAV. Decodes the first images."""
+        return self.first is not None and _opencv_agrees(self.path, self.first)
 
     def unturned(self) -> VideoClip:
         """Return the same images as they are coded."""
         size = (self.height, self.width) if self.turn % 180 else (self.width, self.height)
-        return replace(self, width=size[0], height=size[1], as_coded=True, by_opencv=False)
+        return replace(self, width=size[0], height=size[1], as_coded=True, first=None)
 
     @property
     def by_planes(self) -> bool:
@@ -80,7 +111,7 @@ class VideoClip(Clip):
 
 
 def probe_video(path: Path, is_mask: bool = False) -> VideoClip:
-    """Open a video file, and compare the first images that OpenCV and PyAV decode.
+    """Open a video file, and decode its first images by PyAV.
 
     Frames are counted, and their times read, from the coded packets (about 10 µs a frame): the header of an `.mkv` is
     only an estimate, and the header of a truncated file counts all frames.
@@ -99,7 +130,7 @@ def probe_video(path: Path, is_mask: bool = False) -> VideoClip:
         turn=found.turn,
         interlaced=found.interlaced,
         undecodable=found.undecodable,
-        by_opencv=not (found.interlaced or found.cut) and _opencv_agrees(path, found),
+        first=None if found.interlaced or found.cut else FirstImages.of(found),
         planar=found.pixels in _PLANAR,
         keys=found.keys,
     )
@@ -331,7 +362,7 @@ def _open_opencv(path: Path) -> cv2.VideoCapture:
     return capture
 
 
-def _opencv_agrees(path: Path, contents: Contents) -> bool:
+def _opencv_agrees(path: Path, first: FirstImages) -> bool:
     """Return whether OpenCV decodes the last of the first images of a file as PyAV does, and not an older one."""
     found = []
     try:
@@ -339,15 +370,13 @@ def _opencv_agrees(path: Path, contents: Contents) -> bool:
     except VideoError:
         return False
     try:
-        for _ in contents.first:
+        for _ in range(first.count):
             ok, image = capture.read()
-            if not ok or image.shape[:2] != (contents.height, contents.width):
+            if not ok or image.shape[1::-1] != first.size:
                 return False
             found.append(np.ascontiguousarray(image[::_EVERY, ::_EVERY]))
     finally:
         capture.release()
-    right = np.ascontiguousarray(as_bgr(contents.first[-1], contents.turn // 90)[::_EVERY, ::_EVERY])
-    if cv2.absdiff(right, found[-1]).mean() > _MOST_DIFFERENCE:
+    if cv2.absdiff(first.last, found[-1]).mean() > _MOST_DIFFERENCE:
         return False
-    planes = [bytes(image.planes[0]) for image in contents.first]
-    return planes[0] == planes[-1] or not np.array_equal(found[0], found[-1])
+    return not first.differ or not np.array_equal(found[0], found[-1])

@@ -64,9 +64,13 @@ class LearnedScene:
 def _weights(mask: Images, uncertain: Bool) -> Images:
     """Return the weight (H, W) of a sample's pixels."""
     person = ((mask > 0) | uncertain).view(np.uint8)
-    height = cv2.boundingRect(mask)[3]
-    beside, away = (_dilated(person, round(share * height)) == 0 for share in (_NEAR, _MARGIN))
-    return np.where(away, _AWAY, np.where(beside, _BESIDE, 0)).astype(np.uint8)
+    near, margin = (round(share * cv2.boundingRect(mask)[3]) for share in (_NEAR, _MARGIN))
+    weights = np.full(mask.shape, _AWAY, np.uint8)
+    x, y, w, h = cv2.boundingRect(person)
+    box = slice(max(y - margin, 0), y + h + margin), slice(max(x - margin, 0), x + w + margin)
+    beside, away = (_dilated(person[box], radius) == 0 for radius in (near, margin))
+    weights[box] = np.where(away, _AWAY, np.where(beside, _BESIDE, 0))
+    return weights
 
 
 def _dilated(mask: Images, radius: int) -> ArrayLike:
