@@ -48,7 +48,7 @@ _Asked: TypeAlias = "tuple[int, Segmented]"
 LEARNED, LEARNED_AND_SEGMENTER, SEGMENTER = range(3)
 MASK_SOURCES = ("learned scene", "learned scene and segmenter", "segmenter")
 
-# Seconds of a span, between asked frames, and least number of asked frames of a span.
+# Seconds of a span, between asked frames, and least number of asked frames of a span; the opening waits for so many.
 _SPAN_S, _STEP_S, _LEAST = 10.0, 0.5, 8
 # Asked frames that a source of unknown length is learned from, and how many come between two times of learning.
 _PAST, _EVERY = 16, 4
