@@ -190,7 +190,7 @@ def test_network_is_asked_where_the_frame_leaves_a_limb_open() -> None:
     assert [e.landmarks is None for e in found["network"]] == [False, True, True]
 
 
-def test_network_is_not_asked_where_it_cannot_tell_more() -> None:
+def test_network_is_not_asked_where_the_frame_shows_all_limbs() -> None:
     """The silhouettes show both arms and both legs."""
     pose = with_arm(with_arm(POSES[0], "l", (0.0, 1.0, 0.0), 5.0), "r", (0.0, 1.0, 0.0), 5.0)
     masks, network = draw_silhouettes(BODY, RIG, pose[None])[0], Network(pose)

@@ -314,9 +314,9 @@ class RegionTracker(ContourTracker[RegionState]):
         )
 
     def _is_open(self, variance: Float) -> bool:
-        """Return whether a network tells more about the joints than a frame whose modes have a variance (J,), metres²:
-        a landmark that is seen has a smaller error. Its answers in neighbouring frames are alike, so it is asked once
-        between two routine searches."""
+        """Return whether a network locates a joint better than a frame whose modes have a variance (J,), metres²: the
+        error of a landmark that is seen is smaller. Its answers in neighbouring frames are alike, so it is asked at
+        most once between two routine searches."""
         return self._since_asked >= self.search_frames and bool((variance > landmarks.deviation(np.ones(1)) ** 2).any())
 
     def _ask(self, seen: Seen, pose: Float) -> Seen | None:
