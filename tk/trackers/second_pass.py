@@ -257,8 +257,8 @@ class SecondPass:
         arms = [Alternative(limb.dofs, limb) for limb in limbs if limb.name.startswith("arm")]
         legs = tuple(limb for limb in limbs if limb.name.startswith("leg"))
         rest = np.setdiff1d(every, np.concatenate([arm.dofs for arm in arms]))
-        open_ = [] if self._modes is None else list(self._modes.swapaxes(0, 1))
-        modes = [Alternative(limb.dofs, limb, poses, moves=False) for limb in limbs for poses in open_]
+        rows = [] if self._modes is None else list(self._modes.swapaxes(0, 1))
+        modes = [Alternative(limb.dofs, limb, poses, moves=False) for limb in limbs for poses in rows]
         done: list[Tracks] = []
         for step in (1, -1):
             swapped = np.full_like(self.poses, np.nan)
@@ -269,7 +269,7 @@ class SecondPass:
             for k, one in enumerate(others):
                 other, likelier = self._compared(one, *(values[k] for values in tracks))
                 self.poses[likelier] = other[likelier]
-                change = tracks.cost[k, likelier].copy()
+                change = tracks.cost[k, likelier].copy()  # costs are relative to the present pose
                 for known in (*done, tracks):
                     known.cost[:, likelier] -= change
             done.append(tracks.of(slice(len(others), None)))
