@@ -182,7 +182,7 @@ def test_network_is_asked_where_the_frame_leaves_a_limb_open() -> None:
     for name, ask in (("silhouettes", None), ("network", network)):
         tracker = tracker_at(pose, masks, contours=replace(SETTINGS, search_every=0.2))
         found[name] = [tracker.step(replace(observe(masks, i), ask=ask)) for i in range(3)]
-    assert network.asked == 1  # in the next frames it would say the same
+    assert network.asked == 1  # where the limbs are searched for
     shown = landmark_places(BODY, pose)
     assert np.linalg.norm(network.expected - shown, axis=1).max() < CLOSE_M
     before, after = (found[name][0].deviation for name in ("silhouettes", "network"))

@@ -105,7 +105,6 @@ class RegionState:
         searched: the frame of that search; :data:`_NEVER` before the first one, and where the person has been found
             anew.
         fresh: whether no frame has been tracked yet.
-        since_asked: frames since a network was asked for landmarks.
     """
 
     alive: list[Hypothesis]
@@ -120,7 +119,6 @@ class RegionState:
     spread: Float
     searched: int
     fresh: bool
-    since_asked: int
 
 
 class RegionTracker(ContourTracker[RegionState]):
@@ -159,7 +157,7 @@ class RegionTracker(ContourTracker[RegionState]):
         self._mean_posture: Float = np.zeros((len(JOINTS), 3))
         self._postures = 0
         self._spread: Float = np.zeros(len(JOINTS))
-        self._fresh, self._since_asked = True, self.search_frames
+        self._fresh = True
         self.view_m = CHANGING_M
         self._reset()
 
@@ -258,7 +256,6 @@ class RegionTracker(ContourTracker[RegionState]):
         misplaced = self.misplaced(evidence, look.label)
         searched = self._needs_search(frame, look, misplaced, evidence.hidden(look.label))
         best = self._best.pose
-        self._since_asked += 1
         if searched:
             self._searched = frame.index
             found = limbs.modes(self, seen, best, self.limbs if self._fresh else misplaced)
@@ -315,9 +312,8 @@ class RegionTracker(ContourTracker[RegionState]):
 
     def _is_open(self, variance: Float) -> bool:
         """Return whether a network locates a joint better than a frame whose modes have a variance (J,), metres²: the
-        error of a landmark that is seen is smaller. Its answers in neighbouring frames are alike, so it is asked at
-        most once between two routine searches."""
-        return self._since_asked >= self.search_frames and bool((variance > landmarks.deviation(np.ones(1)) ** 2).any())
+        error of a landmark that is seen is smaller."""
+        return bool((variance > landmarks.deviation(np.ones(1)) ** 2).any())
 
     def _ask(self, seen: Seen, pose: Float) -> Seen | None:
         """Return what a frame shows with a network's landmarks of the person, who is expected at a pose (D,); None if
@@ -325,7 +321,6 @@ class RegionTracker(ContourTracker[RegionState]):
         frame, pyramid = seen.frame, seen.pyramid
         if frame.ask is None or frame.landmarks is not None:
             return None
-        self._since_asked = 0
         found = frame.ask(self.world.points_out(landmarks.points(self.body, pose)))
         marked = landmarks.of_person(None if found is None else found[None], pyramid.masks[0])
         if marked is None:
