@@ -14,6 +14,7 @@ import pytest
 
 from tk.errors import ConfigError
 from tk.segmenters import weights
+from tk.segmenters.weights import at_hand  # not that of the fixture `no_network`
 
 
 @pytest.fixture
@@ -64,3 +65,13 @@ def test_failed_download_is_reported(wheel: list[list[str]], tmp_path: Path, mon
         weights.weights()
     assert "\n" not in str(caught.value) and str(tmp_path / "cache" / "segmenter") in str(caught.value)
     assert not (tmp_path / "cache").exists()
+
+
+def test_weights_at_hand_are_whole_and_nothing_is_downloaded_to_find_out(
+    wheel: list[list[str]], tmp_path: Path
+) -> None:
+    assert not at_hand() and not wheel
+    path = weights.weights()["pose_detection.tflite"]
+    assert at_hand()
+    path.write_bytes(path.read_bytes()[:-1])
+    assert not at_hand()

@@ -82,14 +82,11 @@ def names() -> tuple[str, ...]:
 
 
 def at_hand() -> str | None:
-    """Return the segmenter that is used where nobody has asked for one: the first one that is installed, if its weights
-    are, too."""
-    installed = names()
-    if not installed or installed[0] != _BUILT_IN:
-        return installed[0] if installed else None
+    """Return the built-in segmenter if it is installed with its weights: it may serve where the user has not asked for
+    one. Those of other packages may download something, or fail, when they are loaded."""
     from tk.segmenters import weights
 
-    return _BUILT_IN if weights.at_hand() else None
+    return _BUILT_IN if _BUILT_IN in names() and weights.at_hand() else None
 
 
 def load(name: str) -> Segmenter:

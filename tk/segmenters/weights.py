@@ -65,9 +65,9 @@ def weights() -> dict[str, Path]:
 
 
 def at_hand() -> bool:
-    """Return whether :func:`weights` downloads nothing."""
-    folder = default_cache_dir() / "segmenter"
-    return all(_installed(name) or (folder / name).is_file() for name in FILES)
+    """Return whether :func:`weights` finds all files, undamaged."""
+    paths = {name: _installed(name) or default_cache_dir() / "segmenter" / name for name in FILES}
+    return all(path.is_file() and _is_right(name, path.read_bytes()) for name, path in paths.items())
 
 
 def _is_right(name: str, data: bytes) -> bool:
