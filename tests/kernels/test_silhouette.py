@@ -177,7 +177,7 @@ def seen(masks):
 
 
 def edgels_of(body, masks, pose, settings, dtype=np.float64):
-    return silhouette.find_edgels(body.pack(dtype), seen(masks), pose, settings)
+    return silhouette.find_edgels(body.pack(dtype), seen(masks), pose[None], settings)
 
 
 def equations_of(body, masks, poses, settings, dtype=np.float64):
@@ -190,9 +190,12 @@ PLAIN = SearchSettings(tangential=0.0, robust_px=0.0)
 
 
 def rows_at(pose, edgels):
-    first = np.zeros(len(edgels.part), int)
-    linear = FAMILY.linearised(FAMILY.mean, pose[None])
-    return linear.pose_rows(first, edgels, linear.points(first, edgels))
+    linear, rows = FAMILY.linearised(FAMILY.mean, pose[None]), np.zeros((len(edgels.part), len(pose)))
+    for part in np.unique(edgels.part):
+        own = np.flatnonzero(edgels.part == part)
+        dofs, by_dof = linear.pose_rows(part, edgels.of(own), linear.points(edgels.of(own)))
+        rows[own[:, None], dofs] = by_dof
+    return rows
 
 
 def test_equations_are_the_sums_of_the_edgels_rows():

@@ -34,7 +34,7 @@ class Linear:
         equations = Equations(BLOCKS, OWN, SHARED)
         for b, rows in enumerate(self.rows):
             residual = self.target[b] - rows @ np.concatenate([p[b], s])
-            equations.add(b, [slice(0, OWN), slice(OWN, OWN + SHARED)], rows, self.weight[b], residual)
+            equations.add(np.full(ROWS, b), np.arange(OWN + SHARED), rows, self.weight[b], residual)
             equations.add_block_prior(b, self.own_precision, -p[b])
         if len(self.coupled):
             missing = (
@@ -98,7 +98,7 @@ def walk(frames, seen, step=0.1):
     deviation of 1, in the frames ``seen``, at their number."""
     equations = Equations(frames, 1, 0)
     for b in seen:
-        equations.add(b, [slice(0, 1)], np.eye(1), np.ones(1), np.array([float(b)]))
+        equations.add(np.array([b]), np.array([0]), np.eye(1), np.ones(1), np.array([float(b)]))
     steps = np.zeros((frames - 1, 1))
     equations.couple(np.arange(frames - 1), -np.eye(1), np.eye(1), steps + step**-2, steps)
     return equations.reduced()
@@ -170,7 +170,7 @@ def test_blocks_without_shared_unknowns_are_solved_each_on_its_own():
     def linearise(p, _):
         equations = Equations(BLOCKS, OWN, 0)
         for b in range(BLOCKS):
-            equations.add(b, [slice(0, OWN)], rows[b], np.ones(ROWS), target[b] - rows[b] @ p[b])
+            equations.add(np.full(ROWS, b), np.arange(OWN), rows[b], np.ones(ROWS), target[b] - rows[b] @ p[b])
         return equations
 
     levels = [0] * 100

@@ -46,7 +46,7 @@ def test_no_contour_is_searched_at_another_person() -> None:
         pyramid = views.pyramid(masks[0], 3, True)
         assert all((level == OTHERS).any() == (masks is MARKED) for level in pyramid.masks)
         for scale in range(3):
-            edgels = find_edgels(BODY.arrays, views.at(pyramid, scale), POSES[0], LINE_SEARCH)
+            edgels = find_edgels(BODY.arrays, views.at(pyramid, scale), POSES[:1], LINE_SEARCH)
             found = (edgels.pixel + edgels.distance[:, None] * edgels.normal)[edgels.view == 0, 1]
             assert len(found) > 10
             lowest.append(found.max() - border)

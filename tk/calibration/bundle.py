@@ -273,7 +273,7 @@ class _Problem:
             variance = noise_px**2 + stack.blur_px**2
             weight = np.repeat(1 / (1 + (errors**2).sum(axis=1) / variance / _CAUCHY**2) / variance, 2)
             place = self.slices[stack.camera]
-            columns = [slice(0, 6), slice(6 + place.start, 6 + place.stop)]
+            columns = np.r_[:6, 6 + place.start : 6 + place.stop]
             for block, part in stack.views:
                 twice = slice(2 * part.start, 2 * part.stop)
                 flat = rows[part].reshape(-1, rows.shape[2])
@@ -282,9 +282,13 @@ class _Problem:
                     if each.camera == stack.camera and self.instants[block] in each.instants
                 ]  # fmt: skip
                 by_focal = (flat[:, 12:14] @ state.lenses[stack.camera].values[:2])[:, None].repeat(len(of), axis=1)
-                extra = [slice(6 + shared + k, 7 + shared + k) for k in of]
+                extra = 6 + shared + np.array(of, np.intp)
                 equations.add(
-                    block, [*columns, *extra], np.hstack([flat, by_focal]), weight[twice], errors[part].ravel()
+                    np.full(len(flat), block),
+                    np.concatenate([columns, extra]),
+                    np.hstack([flat, by_focal]),
+                    weight[twice],
+                    errors[part].ravel(),
                 )
         diagonal = np.einsum("ss->s", equations.prior_hessian)
         for c, (lens, place) in enumerate(zip(state.lenses, self.slices, strict=True)):

@@ -78,9 +78,10 @@ class NormalEquations(NamedTuple):
 
 
 class Edgels(NamedTuple):
-    """The samples of one pose that found an edge (N of them)."""
+    """The samples of contours that found an edge (N of them)."""
 
-    # view, part: (N,) camera and part
+    # pose, view, part: (N,) index of the pose, camera and part
+    pose: NDArray[np.int32]
     view: NDArray[np.int32]
     part: NDArray[np.int32]
     unscaled: NDArray[np.float64]  # (N, 3) the contour point as (x / a r, y / b r, z / h) in the part's frame
@@ -91,10 +92,9 @@ class Edgels(NamedTuple):
     pixel: NDArray[np.float64]  # (N, 2) the sample's image
     normal: NDArray[np.float64]  # (N, 2) unit normal of the contour in the image, outwards
 
-    def of_view(self, view: int) -> "Edgels":
-        """Return the edgels of one camera; they are in the order of the cameras."""
-        begin, end = np.searchsorted(self.view, [view, view + 1])
-        return Edgels._make(values[begin:end] for values in self)
+    def of(self, rows: "slice | NDArray[np.integer]") -> "Edgels":
+        """Return some edgels."""
+        return Edgels._make(values[rows] for values in self)
 
 
 @ti.func
@@ -304,7 +304,7 @@ def _descent_kernel(real):
         outlines: ti.types.ndarray(dtype=real, ndim=2),  # (B V Q, 31)
         factor: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (B, n, n + 1)
         # out
-        samples: ti.types.ndarray(dtype=real, ndim=3),  # (V Q, most_samples, _EXPORT), if EXPORT
+        samples: ti.types.ndarray(dtype=real, ndim=3),  # (B V Q, most_samples, _EXPORT), if EXPORT
         sums: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (B, 4 + D) see COST, before the last step
         hessian: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (B, D, D) likewise; zeroed by the caller
     ):
@@ -470,16 +470,18 @@ def descend(
 def find_edgels(
     body: ConeArrays,
     seen: Silhouettes,
-    pose: np.ndarray,
+    poses: np.ndarray,
     settings: SearchSettings,
 ) -> Edgels:
-    """Return the edgels that one pose (D,) finds; arguments as for :func:`normal_equations`."""
-    _, _, samples = _launch(body, seen, pose[None], settings, None, export=True)
-    Q = len(body.curves)
+    """Return the edgels that poses (B, D) find, in the order of poses and views; arguments as for
+    :func:`normal_equations`."""
+    _, _, samples = _launch(body, seen, poses, settings, None, export=True)
+    V, Q = len(seen.cameras), len(body.curves)
     task, index = np.nonzero(samples[:, :, 0])
     chosen = samples[task, index].astype(np.float64)
     return Edgels(
-        view=(task // Q).astype(np.int32),
+        pose=(task // (V * Q)).astype(np.int32),
+        view=(task // Q % V).astype(np.int32),
         part=body.curves[task % Q, 0],
         unscaled=chosen[:, 3:6],
         distance=chosen[:, 1],

@@ -47,41 +47,31 @@ class Equations:
 
     def add(
         self,
-        block: int,
-        columns: Sequence[slice],
+        blocks: NDArray[np.integer],
+        columns: NDArray[np.integer],
         rows: Float,
         weight: Float,
         residual: Float,
-        parts: Sequence[tuple[slice, slice, Float]] = (),
     ) -> None:
-        """Add rows to a block's equations.
+        """Add N rows to the equations of their blocks.
 
         Args:
-            block: index of the block.
-            columns: the unknowns (of D + S) that the rows are derivatives by, as slices in the order of the rows.
+            blocks: (N,) index of each row's block, ascending.
+            columns: (K,) the unknowns (of D + S) that the rows are derivatives by, each once; the same of all rows.
             rows: (N, K) derivatives.
             weight: (N,) information of each row.
             residual: (N,) by how much each row's value should grow.
-            parts: rows that no other part has, other unknowns than ``columns``, and the rows' derivatives by them.
         """
-        root = np.sqrt(weight)
-        scaled, y = rows * root[:, None], residual * root
-        A, g = scaled.T @ scaled, scaled.T @ y  # a symmetric product takes half the time
-        ends = np.cumsum([part.stop - part.start for part in columns])
-        own = [slice(end - (part.stop - part.start), end) for part, end in zip(columns, ends.tolist(), strict=True)]
-        hessian, gradient = self.hessian[block], self.gradient[block]
-        for i, into in zip(own, columns, strict=True):
-            gradient[into] += g[i]
-            for j, across in zip(own, columns, strict=True):
-                hessian[into, across] += A[i, j]
-        for some, into, derivatives in parts:
-            part = derivatives * root[some, None]
-            gradient[into] += part.T @ y[some]
-            hessian[into, into] += part.T @ part
-            A = part.T @ scaled[some]
-            for j, across in zip(own, columns, strict=True):
-                hessian[into, across] += A[:, j]
-                hessian[across, into] += A[:, j].T
+        root, K = np.sqrt(weight), rows.shape[1]
+        present, first, count = np.unique(blocks, return_index=True, return_counts=True)
+        # one product of each block, of as many rows as the largest has
+        scaled = np.zeros((len(present), count.max(initial=0), K + 1))
+        into = np.repeat(np.arange(len(present)), count), np.arange(len(blocks)) - np.repeat(first, count)
+        scaled[*into, :K] = rows * root[:, None]
+        scaled[*into, K] = residual * root
+        products = scaled.swapaxes(1, 2) @ scaled
+        self.hessian[present[:, None, None], columns[:, None], columns] += products[:, :K, :K]
+        self.gradient[present[:, None], columns] += products[:, :K, K]
 
     def add_block_prior(self, block: int, precision: Float, difference: Float) -> None:
         """Add a prior on a block: precision (D,) and the difference (D,) from the estimate to the prior's mean."""

@@ -57,14 +57,14 @@ def edgels_all_over(body, count=400):
     unscaled = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.where(cone, np.abs(z), z)])
     row = rng.normal(size=(count, 3))
     nothing = np.zeros(count)
+    first = nothing.astype(np.int32)
     return Edgels(
-        nothing.astype(np.int32), part, unscaled, nothing, nothing, row, np.zeros((count, 2)), np.zeros((count, 2))
+        first, first, part, unscaled, nothing, nothing, row, np.zeros((count, 2)), np.zeros((count, 2))
     )
 
 
 EDGELS = edgels_all_over(AVERAGE)
 FAMILY = BodyFamily(AVERAGE.dimensions, 0.01)
-FIRST = np.zeros(len(EDGELS.part), int)
 POSE = walk(AVERAGE, 3)[1] + np.random.default_rng(1).normal(0, 0.1, len(AVERAGE.skeleton.names))
 
 
@@ -73,11 +73,21 @@ def along_rows(body, pose):
     return np.einsum("na,na->n", EDGELS.row, surface_points(body, pose, EDGELS.part, EDGELS.unscaled))
 
 
+def dense(rows_of, columns, edgels=EDGELS):
+    """(N, columns) the rows of each part's edgels by all unknowns."""
+    result = np.zeros((len(edgels.part), columns))
+    for part in range(len(AVERAGE.parts)):
+        own = np.flatnonzero(edgels.part == part)
+        unknowns, rows = rows_of(part, edgels.of(own))
+        result[own[:, None], unknowns] = rows
+    return result
+
+
 def test_pose_rows_equal_finite_differences():
     linear = FAMILY.linearised(FAMILY.mean, POSE[None])
     expected = surface_points(AVERAGE, POSE, EDGELS.part, EDGELS.unscaled)
-    np.testing.assert_allclose(linear.points(FIRST, EDGELS), expected)
-    rows = linear.pose_rows(FIRST, EDGELS, linear.points(FIRST, EDGELS))
+    np.testing.assert_allclose(linear.points(EDGELS), expected)
+    rows = dense(lambda part, edgels: linear.pose_rows(part, edgels, linear.points(edgels)), len(POSE))
     for k, step in enumerate(1e-6 * np.eye(len(POSE))):
         expected = (along_rows(AVERAGE, POSE + step) - along_rows(AVERAGE, POSE - step)) / 2e-6
         if AVERAGE.skeleton.is_by_landmarks[k]:
@@ -88,8 +98,14 @@ def test_pose_rows_equal_finite_differences():
 
 def test_shape_rows_equal_finite_differences():
     groups = AVERAGE.shape_groups
-    T = AVERAGE.part_transforms(AVERAGE.skeleton.segment_transforms(POSE))[EDGELS.part]
-    rows = shape_rows(AVERAGE, T, EDGELS)
+    T = AVERAGE.part_transforms(AVERAGE.skeleton.segment_transforms(POSE))
+
+    def of_part(part, edgels):
+        first = SHAPE_NUMBERS * AVERAGE.group[part]
+        at = np.broadcast_to(T[part], (len(edgels.part), 4, 4))
+        return first + np.arange(SHAPE_NUMBERS), shape_rows(AVERAGE, part, at, edgels)
+
+    rows = dense(of_part, SHAPE_NUMBERS * len(groups))
     for k in range(len(groups) * SHAPE_NUMBERS):
         step = np.zeros(len(groups) * SHAPE_NUMBERS)
         step[k] = 1e-6
@@ -101,17 +117,15 @@ def test_shape_rows_equal_finite_differences():
             assert np.abs(expected).max() > 0.01, f"{name}: no edgel moves"
 
 
-def test_camera_without_edgels_has_no_rows():
-    none = Edgels(*(values[:0] for values in EDGELS))
-    rows = shape_rows(AVERAGE, np.zeros((0, 4, 4)), none)
-    assert rows.shape == (0, SHAPE_NUMBERS * len(AVERAGE.shape_groups))
+def test_part_without_edgels_has_no_rows():
+    unknowns, rows = FAMILY.linearised(FAMILY.mean, POSE[None]).parameter_rows(0, EDGELS.of(slice(0, 0)))
+    assert rows.shape == (0, len(unknowns))
 
 
 def test_dimension_rows_equal_finite_differences():
     mean = FAMILY.mean
     shared = mean + np.random.default_rng(2).normal(0, 0.02, len(mean)) * (FAMILY.deviation > 1e-5)
-    rows = FAMILY.linearised(shared, POSE[None]).dimension_rows(FIRST, EDGELS)
-    assert rows.shape == (len(EDGELS.part), len(DIMENSIONS))
+    rows = dense(FAMILY.linearised(shared, POSE[None]).parameter_rows, len(mean))
     change = shared[len(DIMENSIONS) :].reshape(-1, SHAPE_NUMBERS)
     for k, name in enumerate(DIMENSIONS):
         pair = []
@@ -136,9 +150,11 @@ def test_landmark_rows_equal_finite_differences():
 def test_rows_use_the_pose_of_their_frame():
     poses = walk(AVERAGE, 2)
     linear = FAMILY.linearised(FAMILY.mean, poses)
-    both = [linear.rows(FIRST + i, EDGELS) for i in range(2)]
+    K = len(FAMILY.mean)
+    both = [dense(linear.parameter_rows, K, EDGELS._replace(pose=EDGELS.pose + i)) for i in range(2)]
     for pose, rows in zip(poses, both, strict=True):
-        np.testing.assert_allclose(rows, FAMILY.linearised(FAMILY.mean, pose[None]).rows(FIRST, EDGELS), atol=1e-9)
+        alone = FAMILY.linearised(FAMILY.mean, pose[None])
+        np.testing.assert_allclose(rows, dense(alone.parameter_rows, K), atol=1e-9)
     assert np.abs(both[0] - both[1]).max() > 0.01
 
 

@@ -18,7 +18,7 @@ from tk.kernels.silhouette import Edgels
 from tk.model.body.anthropometry import DIMENSIONS, UPRIGHT, BodyDimensions
 from tk.model.body.body_points import SEGMENT, places
 from tk.model.body.cone_body import SHAPE_NUMBERS, ConeBody, ConePart, build_cone_body, group_of, part_arrays
-from tk.model.body.skeleton import Skeleton, build_skeleton
+from tk.model.body.skeleton import Skeleton, build_skeleton, cross
 
 Float = NDArray[np.float64]
 
@@ -68,6 +68,7 @@ class BodyFamily:
         self.mean = np.concatenate([np.log(average.values), np.zeros(SHAPE_NUMBERS * len(self.groups))])
         self.deviation = np.concatenate([[_LENGTHS.get(name, _RADII) for name in DIMENSIONS], np.ravel(shapes)])
         self.start = self.mean.copy()
+        self._built: tuple[Float, ConeBody] | None = None
 
     @staticmethod
     def around(body: ConeBody, stature_deviation: float) -> BodyFamily:
@@ -80,7 +81,12 @@ class BodyFamily:
         return self
 
     def build(self, shared: Float) -> ConeBody:
-        """Return the body with parameters (K,)."""
+        """Return the body with parameters (K,). The last one is kept: its contours are searched, then derived."""
+        if self._built is None or not np.array_equal(self._built[0], shared):
+            self._built = shared.copy(), self._build(shared)
+        return self._built[1]
+
+    def _build(self, shared: Float) -> ConeBody:
         return build_cone_body(BodyDimensions.of(np.exp(shared[: len(DIMENSIONS)]))).reshaped(self._change(shared))
 
     def _change(self, shared: Float) -> Float:
@@ -104,8 +110,8 @@ class BodyFamily:
     def landmark_rows(self, shared: Float, poses: Float) -> Float:
         """Return the derivatives (F, L, 3, K) of the points that landmarks mark by the parameters (K,), at poses
         (F, D)."""
-        each = [places(BodyDimensions.of(one)) for one in np.exp(self._around(shared))]
-        return self._rows(shared, poses, SEGMENT, (np.array(each[1:]) - each[0]) / _STEP)
+        here, *others = places(BodyDimensions.of(np.exp(self._around(shared))))
+        return self._rows(shared, poses, SEGMENT, (np.array(others) - here) / _STEP)
 
     def joint_rows(self, shared: Float, poses: Float) -> Float:
         """Return the derivatives (F, J, 3, K) of the joints by the parameters (K,), at poses (F, D)."""
@@ -132,7 +138,7 @@ class BodyFamily:
     def _segment_moves(self, shared: Float, poses: Float) -> tuple[Skeleton, Float]:
         """Return the skeleton with parameters (K,), and the derivatives (F, S, 3, 24) of its segments' places by the
         dimensions, at poses (F, D)."""
-        skeleton = build_skeleton(BodyDimensions.of(np.exp(shared[: len(DIMENSIONS)])))
+        skeleton = self.build(shared).skeleton
         changed = build_skeleton(BodyDimensions.of(np.exp(self._around(shared)[1:])))
         point, rise = (changed.point - skeleton.point) / _STEP, (changed.rise - skeleton.rise) / _STEP
         return skeleton, skeleton.segment_moves(poses, point, rise)
@@ -152,7 +158,7 @@ class BodyFamily:
 
 @dataclass(frozen=True)
 class LinearisedBody:
-    """A body at M poses, with derivatives by pose and parameters. Methods take N edgels and each one's pose (N,)."""
+    """A body at M poses, with derivatives by pose and parameters. Methods take N edgels, which tell their poses."""
 
     body: ConeBody
     T_world_segment: Float  # (M, S, 4, 4) transforms of its segments
@@ -164,43 +170,40 @@ class LinearisedBody:
     def _T_world_part(self) -> Float:
         return self.body.part_transforms(self.T_world_segment)
 
-    def points(self, pose: NDArray[np.integer], edgels: Edgels) -> Float:
+    def points(self, edgels: Edgels) -> Float:
         """Return the edgels' points (N, 3) on the surface, world frame, metres."""
-        T = self._T_world_part[pose, edgels.part]
+        T = self._T_world_part[edgels.pose, edgels.part]
         local = self.body.local(edgels.part, edgels.unscaled)
         return np.asarray((T[:, :3, :3] @ local[:, :, None])[:, :, 0] + T[:, :3, 3])
 
-    def pose_rows(self, pose: NDArray[np.integer], edgels: Edgels, x_world: Float) -> Float:
-        """Return the derivatives (N, D) of the contour's position along its normal by the pose, pixels, at N points."""
-        # n · (ω × x + v) = ω · (x × n) + v · n
-        wrench = np.hstack([np.cross(x_world, edgels.row), edgels.row])
-        rows = np.empty((len(pose), self.twists.shape[-1]))
-        for m in np.unique(pose):
-            rows[pose == m] = wrench[pose == m] @ self.twists[m]
+    def pose_rows(self, part: int, edgels: Edgels, x_world: Float) -> tuple[NDArray[np.intp], Float]:
+        """Return the degrees of freedom (k,) that move a part's contours, and the derivatives (N, k) by them of the
+        contours' positions along their normals, pixels, at edgels of this part and their points (N, 3)."""
         skeleton = self.body.skeleton
-        rows[~skeleton.ancestors[self.body.frames[0][edgels.part]] | skeleton.is_by_landmarks] = 0.0
-        return rows
+        moved = skeleton.ancestors[self.body.frames[0][part]] & ~skeleton.is_by_landmarks
+        # n · (ω × x + v) = ω · (x × n) + v · n
+        wrench = np.hstack([cross(x_world, edgels.row), edgels.row])
+        return np.flatnonzero(moved), (wrench[:, None] @ self.twists[:, :, moved][edgels.pose])[:, 0]
 
-    def rows(self, pose: NDArray[np.integer], edgels: Edgels) -> Float:
-        """Return the derivatives (N, K) by all parameters of the body."""
-        shape = shape_rows(self.body, self._T_world_part[pose, edgels.part], edgels)
-        return np.hstack([self.dimension_rows(pose, edgels), shape])
+    def parameter_rows(self, part: int, edgels: Edgels) -> tuple[NDArray[np.intp], Float]:
+        """Return the parameters of the body (k,) that change a part, and the derivatives (N, k) by them at edgels of
+        this part."""
+        moves, by_number = self.moves[:, self.body.frames[0][part]], self.by_part[part]
+        used = np.flatnonzero(moves.any(axis=(0, 1)) | by_number.any(axis=0))
+        rows = (edgels.row[:, None] @ moves[..., used][edgels.pose])[:, 0]
+        rows += self._numbers(part, edgels) @ by_number[:, used]
+        shape = shape_rows(self.body, part, self._T_world_part[edgels.pose, part], edgels)
+        own = len(DIMENSIONS) + SHAPE_NUMBERS * self.body.group[part] + np.arange(SHAPE_NUMBERS)
+        return np.concatenate([used, own]), np.hstack([rows, shape])
 
-    def dimension_rows(self, pose: NDArray[np.integer], edgels: Edgels) -> Float:
-        """Return the derivatives (N, 24) by the dimensions."""
-        part, u = edgels.part, edgels.unscaled
-        segments, inside = self.body.frames
-        segment = segments[part]
-        n = (edgels.row[:, None, :] @ self.T_world_segment[pose, segment, :3, :3])[:, 0]
-        local = np.column_stack([self.body.local(part, u), np.ones(len(part))])
-        a, b, h = ((n[:, None, :] @ inside[part, :3, :3])[:, 0] * u).T
-        numbers = np.column_stack(
-            [(n[:, :, None] * local[:, None, :]).reshape(-1, 12), a, a * u[:, 2], b, b * u[:, 2], h]
-        )
-        rows = np.einsum("na,nak->nk", edgels.row, self.moves[pose, segment])
-        for p, by_number in enumerate(self.by_part):
-            rows[part == p] += numbers[part == p] @ by_number
-        return rows
+    def _numbers(self, part: int, edgels: Edgels) -> Float:
+        """Return the derivatives (N, 17) by what :func:`_part_numbers` gives for a part, at edgels of this part."""
+        u, segments, inside = edgels.unscaled, *self.body.frames
+        n = (edgels.row[:, None] @ self.T_world_segment[edgels.pose, segments[part], :3, :3])[:, 0]
+        local = np.column_stack([self.body.local(edgels.part, u), np.ones(len(u))])
+        a, b, h = (n @ inside[part, :3, :3] * u).T
+        place = (n[:, :, None] * local[:, None, :]).reshape(-1, 12)
+        return np.column_stack([place, a, a * u[:, 2], b, b * u[:, 2], h])
 
 
 def _part_numbers(shape: Float, T_segment_part: Float) -> Float:
@@ -214,31 +217,31 @@ def _part_numbers(shape: Float, T_segment_part: Float) -> Float:
     return np.concatenate([place, np.stack([a, a * (m - 1), b, b * (m - 1), h], axis=-1)], axis=-1)
 
 
-def shape_rows(body: ConeBody, T_world_part: Float, edgels: Edgels) -> Float:
-    """Return (N, 8 G) derivatives by the changes of :meth:`ConeBody.reshaped` at no change, to first order.
+def shape_rows(body: ConeBody, part: int, T_world_part: Float, edgels: Edgels) -> Float:
+    """Return (N, 8) derivatives by the changes of :meth:`ConeBody.reshaped` at no change, to first order, of a part's
+    contours at edgels of this part.
 
-    An axis whose ends move apart tilts, and the cross-sections tilt with it. ``T_world_part`` (N, 4, 4) belongs to each
-    edgel's part.
+    An axis whose ends move apart tilts, and the cross-sections tilt with it. ``T_world_part`` (N, 4, 4) is the part's
+    place at each edgel's pose.
     """
-    part, u = edgels.part, edgels.unscaled
+    u, (a, b, h, m) = edgels.unscaled, body.shape[part]
     n = (edgels.row[:, None, :] @ T_world_part[:, :3, :3])[:, 0]  # the row in the part's frame
-    shape, cone, local = body.shape[part], body.is_cone[part], body.local(part, u)
-    along = np.where(cone, u[:, 2], 0.5 * (u[:, 2] + 1))  # 0 at the beginning of the axis, 1 at its end
-    length = np.where(cone, shape[:, 2], 2 * shape[:, 2])
-    grown = np.where(cone, shape[:, 3] * u[:, 2], 0.0)  # derivative of the radius factor by log m
-    rows = np.zeros((len(part), SHAPE_NUMBERS))
+    local = body.local(edgels.part, u)
+    cone = body.is_cone[part]
+    along = u[:, 2] if cone else 0.5 * (u[:, 2] + 1)  # 0 at the beginning of the axis, 1 at its end
+    length = h if cone else 2 * h
+    grown = m * u[:, 2] if cone else np.zeros(len(u))  # derivative of the radius factor by log m
+    rows = np.zeros((len(u), SHAPE_NUMBERS))
     rows[:, 0] = n[:, 0] * local[:, 0]
     rows[:, 1] = n[:, 1] * local[:, 1]
-    rows[:, 2] = grown * (n[:, 0] * shape[:, 0] * u[:, 0] + n[:, 1] * shape[:, 1] * u[:, 1])
+    rows[:, 2] = grown * (n[:, 0] * a * u[:, 0] + n[:, 1] * b * u[:, 1])
     rows[:, 3] = n[:, 2] * local[:, 2]
     for axis in range(2):
         side = body.mirror[part] if axis == 1 else 1.0
         tilt = n[:, 2] * local[:, axis] / length
         rows[:, 4 + axis] = side * ((1 - along) * n[:, axis] + tilt)
         rows[:, 6 + axis] = side * (along * n[:, axis] - tilt)
-    result = np.zeros((len(part), len(body.shape_groups), SHAPE_NUMBERS))
-    result[np.arange(len(part)), body.group[part]] = rows
-    return result.reshape(len(part), SHAPE_NUMBERS * len(body.shape_groups))
+    return rows
 
 
 def shapes_of(body: ConeBody) -> Float:

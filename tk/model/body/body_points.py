@@ -47,9 +47,11 @@ def _face(name: str, side: float) -> BodyPoint:
 
 
 def sole_offset(name: str, dimensions: BodyDimensions) -> Float:
-    """Return the vector (3,) from the ankle to heel or toe, standing body: forward, left, up, metres."""
+    """Return the vector (3,) from the ankle to heel or toe, standing body: forward, left, up, metres; (N, 3) of N
+    bodies, dimensions (N, 1)."""
+    forward, _, up = np.eye(3)
     share = _HEEL if name.startswith("heel") else _TOE
-    return np.array([share * dimensions.foot, 0.0, -dimensions.ankle_height])
+    return np.asarray(share * dimensions.foot * forward - dimensions.ankle_height * up)
 
 
 def _foot(name: str, side: str) -> BodyPoint:
@@ -96,5 +98,6 @@ SEGMENT = np.array([SEGMENTS.index(point.segment) for point in POINTS.values()],
 
 
 def places(d: BodyDimensions) -> Float:
-    """Return the points (L, 3) in the zero configuration, body frame, metres."""
-    return np.array([point.place(d) for point in POINTS.values()])
+    """Return the points (L, 3) in the zero configuration, body frame, metres; (N, L, 3) of N bodies, dimensions
+    (N, 1)."""
+    return np.stack(np.broadcast_arrays(*(point.place(d) for point in POINTS.values())), axis=-2)

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise, starmap
 
 import cv2
 import numpy as np
@@ -74,13 +76,18 @@ class BundleFrame:
 
 @dataclass(frozen=True)
 class Contours:
-    """The edgels of one frame in one camera, or in all cameras if these are known."""
+    """The edgels of F frames in C cameras.
 
-    # frame, camera: indices; camera 0 stands for all
-    frame: int
-    camera: int
-    pose: Float  # (D,) at which the body was rendered: the pose at the camera's own time
-    edgels: Edgels  # of these cameras
+    Attributes:
+        edgels: N of them, in the order of parts, then of frames; their view is the camera.
+        frame: (N,) index of each one's frame.
+        poses: (M, D) at which the body was rendered: those of the frames, or, if cameras have delays, of each frame at
+            each camera's own time.
+    """
+
+    edgels: Edgels
+    frame: NDArray[np.integer]
+    poses: Float
 
 
 @dataclass(frozen=True)
@@ -142,65 +149,62 @@ class ContourBundle:
         """Return the time offset (C,) of each camera, frames."""
         return state.change[:, -1] if "offset" in self.parameters else np.zeros(len(self.rig))
 
-    def contours(self, state: BundleState, scale: int) -> list[Contours]:
-        """Find the edgels at an estimate and a scale's index, frame by frame."""
-        body, offsets = self.family.build(state.body), self.offsets(state)
-        together = not offsets.any()  # one launch for all cameras of a frame
-        views = [Views(state.rig)] if together else [Views(Rig((camera,))) for camera in state.rig]
+    @cached_property
+    def _masks(self) -> list[NDArray[np.uint8]]:
+        """(C, F, H, W) of each scale."""
+        scales = zip(*(frame.pyramid.masks for frame in self.frames), strict=True)
+        return [np.stack(masks, axis=1) for masks in scales]
+
+    def contours(self, state: BundleState, scale: int) -> Contours:
+        """Find the edgels at an estimate and a scale's index."""
+        arrays, offsets, F = self.family.build(state.body).arrays, self.offsets(state), len(self.frames)
+        whole, masks = Views(state.rig).at(self.frames[0].pyramid, scale), self._masks[scale]
+        velocity = np.array([frame.velocity for frame in self.frames])
+        delayed = offsets.any()  # cameras with delays show different poses
+        poses = state.poses + (offsets if delayed else np.zeros(1))[:, None, None] * velocity
         found = []
-        for f, (frame, pose) in enumerate(zip(self.frames, state.poses, strict=True)):
-            for c, view in enumerate(views):
-                own = slice(None) if together else slice(c, c + 1)
-                pyramid = Pyramid(
-                    tuple(level[own] for level in frame.pyramid.masks), tuple(s[own] for s in frame.pyramid.sizes)
-                )
-                here = pose + offsets[c] * frame.velocity
-                edgels = find_edgels(body.arrays, view.at(pyramid, scale), here, self._settings)
-                if together and self.parameters:
-                    found += [Contours(f, k, here, edgels.of_view(k)) for k in range(len(state.rig))]
-                else:
-                    found.append(Contours(f, c, here, edgels))
-        return found
+        for c, shown in enumerate(masks):
+            k, own = c * delayed, slice(c, c + 1)
+            seen = whole._replace(cameras=whole.cameras[own], sizes=whole.sizes[own], masks=shown)
+            edgels = find_edgels(arrays, seen, poses[k], self._settings)
+            found.append(edgels._replace(pose=k * F + edgels.pose, view=edgels.view + np.int32(c)))
+        every = Edgels._make(map(np.concatenate, zip(*found, strict=True)))
+        order = np.lexsort([every.pose % F, every.part])
+        return Contours(every.of(order), every.pose[order] % F, poses.reshape(-1, poses.shape[-1]))
 
     def linearise(self, state: BundleState, scale: int) -> Equations:
         """Return the equations at an estimate and a scale's index, priors included."""
         return self.equations(state, self.contours(state, scale))
 
-    def equations(self, state: BundleState, contours: Sequence[Contours]) -> Equations:
+    def equations(self, state: BundleState, contours: Contours) -> Equations:
         """Return the equations of contours at an estimate, priors included.
 
         A block holds a frame's pose and, unless segments are fixed, the displacement (3,) of every segment.
         """
-        linear = self.family.linearised(state.body, np.array([view.pose for view in contours]))
-        s = linear.body.skeleton
-        P, L, k, K = len(s.names), 3 * len(SEGMENTS), len(self.sigma), len(state.body)
-        if self._segment_m is None:
-            L = 0
+        linear, edgels = self.family.linearised(state.body, contours.poses), contours.edgels
+        s, segments = linear.body.skeleton, linear.body.frames[0]
+        P, L, K = len(s.names), 0 if self._segment_m is None else 3 * len(SEGMENTS), len(state.body)
         D, S = P + L, self.cameras.stop + K
         found = Equations(len(self.frames), D, S)
-        first = np.flatnonzero(np.diff([-1, *(view.frame for view in contours)])).tolist()
-        for begin, end in zip(first, [*first[1:], len(contours)], strict=True):  # small arrays are faster: by frame
-            views = contours[begin:end]
-            edgels = Edgels(*map(np.concatenate, zip(*(view.edgels for view in views), strict=True)))
-            ends = np.cumsum([len(view.edgels.part) for view in views]).tolist()
-            at = np.repeat(np.arange(begin, end), np.diff(ends, prepend=0))
-            x = linear.points(at, edgels)
-            by_segment = np.zeros((len(x), len(SEGMENTS) if L else 0, 3))
+        x = linear.points(edgels)
+        by_camera, weight = self._camera_rows(state.rig, x, edgels), self._information * edgels.weight
+        velocity = np.array([frame.velocity for frame in self.frames])
+        ends = np.searchsorted(edgels.part, np.arange(len(segments) + 1)).tolist()
+        for part, own in enumerate(starmap(slice, pairwise(ends))):  # a part depends on few of the unknowns
+            some, frame = edgels.of(own), contours.frame[own]
+            dofs, by_pose = linear.pose_rows(part, some, x[own])
+            parameters, by_parameter = linear.parameter_rows(part, some)
+            rows, columns = [by_pose, by_parameter], [dofs, D + self.cameras.stop + parameters]
             if L:
-                by_segment[np.arange(len(x)), linear.body.frames[0][edgels.part]] = edgels.row
-            rows = np.hstack([linear.pose_rows(at, edgels, x), by_segment.reshape(len(x), L), linear.rows(at, edgels)])
-            parts = []
-            for view, i, j in zip(views, [0, *ends], ends, strict=False) if self.parameters else ():
-                by_camera = [
-                    (rows[i:j, :P] @ self.frames[view.frame].velocity)[:, None]
-                    if name == "offset"
-                    else camera_rows(state.rig[view.camera], x[i:j], view.edgels, name)
-                    for name in self.parameters
-                ]
-                own = D + view.camera * k
-                parts.append((slice(i, j), slice(own, own + k), np.hstack(by_camera)))
-            columns, weight = [slice(0, D), slice(D + S - K, D + S)], self._information * edgels.weight
-            found.add(views[0].frame, columns, rows, weight, edgels.distance, parts)
+                rows.append(some.row)
+                columns.append(P + 3 * segments[part] + np.arange(3))
+            if self.parameters:
+                if "offset" in self.parameters:
+                    by_delay = (by_pose * velocity[frame][:, dofs]).sum(axis=1)
+                    by_camera[own][np.arange(len(frame)), some.view, -1] = by_delay
+                rows.append(by_camera[own].reshape(len(frame), -1))
+                columns.append(D + np.arange(self.cameras.stop))
+            found.add(frame, np.concatenate(columns), np.hstack(rows), weight[own], some.distance)
         marked = [f for f, frame in enumerate(self.frames) if MARKED in frame.pyramid.measured]
         if marked:
             # a network's depth is too cautious, by an unknown share: it says nothing about the body's lengths
@@ -227,6 +231,16 @@ class ContourBundle:
         g[cameras] -= camera_precision * state.change.ravel()
         self.family.add_prior(state.body, H[cameras.stop :, cameras.stop :], g[cameras.stop :])
         return found
+
+    def _camera_rows(self, rig: Rig, x_world: Float, edgels: Edgels) -> Float:
+        """Return the derivatives (N, C, k) of the contours' positions by the parameters of the cameras, those by
+        "offset" zero, at the points (N, 3) of edgels."""
+        result, names = np.zeros((len(x_world), len(rig), len(self.sigma))), [p for p in self.parameters if p != "offset"]
+        for c, camera in enumerate(rig) if names else ():
+            own = np.flatnonzero(edgels.view == c)
+            rows = np.hstack([camera_rows(camera, x_world[own], edgels.of(own), name) for name in names])
+            result[own, c, : rows.shape[1]] = rows
+        return result
 
     def move(self, state: BundleState, poses: Float, shared: Float) -> BundleState:
         """Return the estimate after steps of the blocks (F, D or more; poses come first) and of the shared unknowns."""
@@ -272,13 +286,13 @@ def _moved(camera: Camera, parameters: Sequence[str], row: Float) -> Camera:
 
 
 def residual_px(contours: Sequence[Contours], count: int) -> Float:
-    """Return (C,) the weighted root mean square distance of contours from edges in ``count`` cameras, pixels; NaN
-    without edgels."""
-    sums = np.zeros((count, 2))
-    for view in contours:
-        weight = view.edgels.weight
-        sums[view.camera] += [(weight * view.edgels.distance**2).sum(), weight.sum()]
-    return np.sqrt(sums[:, 0] / np.where(sums[:, 1] > 0, sums[:, 1], np.nan))
+    """Return (C,) the weighted root mean square distance of people's contours from edges in ``count`` cameras, pixels;
+    NaN without edgels."""
+    square, weight = np.zeros(count), np.zeros(count)
+    for edgels in (one.edgels for one in contours):
+        square += np.bincount(edgels.view, edgels.weight * edgels.distance**2, count)
+        weight += np.bincount(edgels.view, edgels.weight, count)
+    return np.sqrt(square / np.where(weight > 0, weight, np.nan))
 
 
 def choose_frames(

@@ -66,8 +66,8 @@ class PeopleBundle:
         return self.bundles[0].offsets(states[0])
 
     def contours(self, states: States, scale: int) -> list[Contours]:
-        """Find the edgels of all people at an estimate and a scale's index."""
-        return [view for b, state in zip(self.bundles, states, strict=True) for view in b.contours(state, scale)]
+        """Find the edgels of each person at an estimate and a scale's index."""
+        return [bundle.contours(state, scale) for bundle, state in zip(self.bundles, states, strict=True)]
 
     def linearise(self, states: States, scale: int) -> Equations:
         """Return the equations at an estimate and a scale's index. The blocks are the frames of one person after those
