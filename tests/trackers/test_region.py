@@ -24,13 +24,13 @@ from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.setup import InitPose, Setup, Subject
 from tk.settings import RegionSettings, Settings, SilhouetteSettings
 from tk.trackers import second_pass
+from tk.trackers.alternatives import second_of_two
 from tk.trackers.judgement import UNKNOWN_AFTER
 from tk.trackers.proposals import anywhere, limbs
 from tk.trackers.proposals import exchanged as exchanged_limbs
 from tk.trackers.reason import Reason
 from tk.trackers.region import RegionTracker
 from tk.trackers.residual import LEAST_SPREAD
-from tk.trackers.second_pass import second_of_two
 from tk.trackers.silhouette import SilhouetteTracker
 
 RIG = ring_of_cameras(3, width=160, height=200)

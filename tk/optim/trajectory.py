@@ -66,9 +66,9 @@ class Equations:
         present, first, count = np.unique(blocks, return_index=True, return_counts=True)
         # one product of each block, of as many rows as the largest has
         scaled = np.zeros((len(present), count.max(initial=0), K + 1))
-        into = np.repeat(np.arange(len(present)), count), np.arange(len(blocks)) - np.repeat(first, count)
-        scaled[*into, :K] = rows * root[:, None]
-        scaled[*into, K] = residual * root
+        block, row = np.repeat(np.arange(len(present)), count), np.arange(len(blocks)) - np.repeat(first, count)
+        scaled[block, row, :K] = rows * root[:, None]
+        scaled[block, row, K] = residual * root
         products = scaled.swapaxes(1, 2) @ scaled
         self.hessian[present[:, None, None], columns[:, None], columns] += products[:, :K, :K]
         self.gradient[present[:, None], columns] += products[:, :K, K]

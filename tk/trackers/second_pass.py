@@ -6,13 +6,7 @@ Each frame stays near its pose of the first pass, because that has used colours 
 This matters with the same body and cameras, too: without it, the limbs' mean error on the eight captures is 0.03 cm
 larger, with two cameras 0.1 cm, and more limbs stay more than 10 cm off.
 
-The first pass may have misplaced an arm, exchanged the legs, or taken the back for the front, for a while. So other
-poses of the body and of its arms are tracked through the whole recording, forwards and backwards. They begin at the
-prediction from the neighbouring frames, or at the exchanged legs. A hidden Markov model with two states, the present
-and the other pose, gives the probability of either in each frame, from the costs in all frames and the changes of the
-joints' velocities (Rabiner, Proc. IEEE, 1989). The pose becomes the likelier one, and σ includes the difference. Other
-poses that the first pass found in its limb searches are tracked in the same manner, from the frames of the searches on,
-and only add to σ: the first pass has compared them with colours.
+Poses that the first pass may have taken for others are compared with these (:mod:`tk.trackers.alternatives`).
 
 Then one problem of all frames, coupled by the motion, gives the poses and their covariances
 (:mod:`tk.optim.trajectory`).
@@ -21,10 +15,8 @@ Then one problem of all frames, coupled by the motion, gives the poses and their
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +24,7 @@ from numpy.typing import NDArray
 from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.body.body_fit import STATURE_DEVIATION
 from tk.model.body.joint_sigma import CONSTANT_M, directions, posture_variance
-from tk.model.body.limb_candidates import Limb, exchanged
-from tk.model.body.skeleton import JOINTS, blocks
+from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.bundle import LONGEST_STEP, SEGMENT_M
 from tk.model.cues import landmarks
 from tk.model.cues.cue import Measured, in_frames
@@ -41,81 +32,25 @@ from tk.model.cues.ray_costs import residual_of
 from tk.model.masks.silhouettes import Pyramid
 from tk.model.motion.coupling import MotionTerm
 from tk.optim.trajectory import Equations
-from tk.trackers.hypotheses import DROPPED, RENEWAL, SAME_POSE_M
+from tk.trackers.alternatives import ANGLE_DEG, AT_ONCE, LEVEL, Choice, apart
 
 if TYPE_CHECKING:
     from tk.trackers.region import RegionTracker
 
 Float = NDArray[np.float64]
 
-# Frames of the body fit, and how far a frame may move from its pose in the first pass.
+# Frames of the body fit.
 FIT_FRAMES = 24
-ANGLE_DEG = 15.0
 # Standard deviation of the logarithm of the stature about that of the first fit, where no height was given.
 STATURE = 0.03
-# Frames that are refined in one launch.
-AT_ONCE = 16
 # Iterations over all frames together; frames of which the equations are in memory at once, and frames before and after
 # them that are solved with them: what a frame shows about others fades within some frames.
 ROUNDS, WINDOW, OVERLAP = 2, 1000, 30
-# Scale at which other poses are optimised.
-LEVEL = 1
 # Clothes, shadows and the shapes of the model err alike as long as the pose is the same. So the likelihood of a frame
 # counts by the share of CORRELATED_M, metres, that the fastest joint moves in it, and at least by its share of STILL_S,
 # seconds: a person who stands still is seen once, not once a frame. CORRELATED_M was chosen on rendered people
 # (docs/experiments.md, Sigma); STILL_S is assumed.
 CORRELATED_M, STILL_S = 0.2, 1.0
-# People keep their velocity: VELOCITY times a step predicts the next one best (docs/experiments.md, Second pass; the
-# first pass, whose poses are less exact, predicts less), and the negative logarithm of a step's probability is the
-# distance to this prediction, of the joint that is farthest from it, divided by CHANGE_M. In frames with pixels of
-# other people another pose costs SHARED nats more, because the masks do not show the colours by which the first pass
-# has chosen.
-VELOCITY, CHANGE_M, SHARED = 0.8, SAME_POSE_M, 1.0
-
-
-@dataclass(frozen=True)
-class Alternative:
-    """Another pose of some limbs.
-
-    Attributes:
-        dofs: the degrees of freedom in which it differs.
-        limb: if they are a limb's, only this limb moves.
-        begins: (F, D) the poses at which it begins in each frame, NaN where it does not; None: at the prediction from
-            the neighbouring frames.
-        moves: whether a pose at which it begins shows where it was in the frame before, and so its velocity.
-    """
-
-    dofs: NDArray[np.int64]
-    limb: Limb | None = None
-    begins: Float | None = None
-    moves: bool = True
-
-
-class Tracks(NamedTuple):
-    """A alternatives, tracked through F frames in one direction.
-
-    Attributes:
-        poses: (A, F, D).
-        found: (A, F) whether an alternative differs from the pose that was the present one, and is not improbable.
-        cost: (A, F) by how much it costs more than that pose, nats; 0 where it is not found.
-    """
-
-    poses: Float
-    found: NDArray[np.bool_]
-    cost: Float
-
-    def of(self, rows: slice) -> Tracks:
-        """Return some alternatives."""
-        return Tracks(self.poses[rows], self.found[rows], self.cost[rows])
-
-    def beside(self, other: Tracks) -> Tracks:
-        """Return these alternatives, and in frames in which they are not found those of another direction."""
-        own = self.found
-        return Tracks(
-            np.where(own[..., None], self.poses, other.poses),
-            own | other.found,
-            np.where(own, self.cost, other.cost),
-        )
 
 
 class SecondPass:
@@ -150,7 +85,6 @@ class SecondPass:
         self.tracker, self._masks, self._report = tracker, masks, report
         self._measured, self._modes = measured, modes
         self.tracked = np.flatnonzero(~lost)
-        self._seen = frozenset(self.tracked.tolist())
         self._share = np.ones(len(poses))
         steps, seen = _steps(tracker.body.skeleton.joints(poses[self.tracked])), len(self.tracked)
         self._share[self.tracked] = np.clip(steps / CORRELATED_M, 1.0 / min(tracker.fps * STILL_S, seen), 1.0)
@@ -251,43 +185,29 @@ class SecondPass:
         return residual_of(label > 0, sampled >= PERSON, sampled == OTHERS)
 
     def decide(self) -> None:
-        """Track other poses of the limbs in both directions, and replace the present ones where these are likelier;
-        with them those that the first pass left open."""
-        limbs, every = self.tracker.limbs, np.arange(self.poses.shape[1])
-        arms = [Alternative(limb.dofs, limb) for limb in limbs if limb.name.startswith("arm")]
-        legs = tuple(limb for limb in limbs if limb.name.startswith("leg"))
-        rest = np.setdiff1d(every, np.concatenate([arm.dofs for arm in arms]))
-        rows = [] if self._modes is None else list(self._modes.swapaxes(0, 1))
-        modes = [Alternative(limb.dofs, limb, poses, moves=False) for limb in limbs for poses in rows]
-        done: list[Tracks] = []
-        for step in (1, -1):
-            swapped = np.full_like(self.poses, np.nan)
-            tracked = [exchanged(poses, [legs])[0] for poses in blocks(self.poses[self.tracked])]
-            swapped[self.tracked] = np.concatenate(tracked)
-            others = [Alternative(every), Alternative(rest, begins=swapped), *arms]
-            tracks = self._track([*others, *modes], step)
-            for k, one in enumerate(others):
-                other, likelier = self._compared(one, *(values[k] for values in tracks))
-                self.poses[likelier] = other[likelier]
-                change = tracks.cost[k, likelier].copy()  # costs are relative to the present pose
-                for known in (*done, tracks):
-                    known.cost[:, likelier] -= change
-            done.append(tracks.of(slice(len(others), None)))
-        for one, poses, found, cost in zip(modes, *done[0].beside(done[1]), strict=True):
-            self._compared(one, poses, found, cost)
-
-    def _compared(
-        self, one: Alternative, poses: Float, found: NDArray[np.bool_], cost: Float
-    ) -> tuple[Float, NDArray[np.int64]]:
-        """Return the present poses (F, D) with an alternative's limbs, where it is found, and the frames in which these
-        are likelier; add the spread of the two to the variance. Arguments as in :class:`Tracks`."""
-        skeleton, frames, other = self.tracker.body.skeleton, self.tracked, self.poses.copy()
-        other[np.ix_(found, one.dofs)] = poses[np.ix_(found, one.dofs)]
-        joints = skeleton.joints(np.array([self.poses[frames], other[frames]]))
-        share = second_of_two(np.where(found, cost, 0.0)[frames], _surprises(joints, frames) / CHANGE_M)
-        apart = ((joints[1] - joints[0]) ** 2).sum(axis=-1) / 3
-        self._variance[1, frames] += (share * (1.0 - share))[:, None] * apart
-        return other, frames[(share > 0.5) & found[frames]]
+        """Replace the poses of limbs where others, which are tracked beside them, are likelier; add what stays open to
+        the variance. Frames between those of the comparison take part in the nearest one's change."""
+        tracked, share = self.tracked, self._share[self.tracked]
+        modes = None if self._modes is None else self._modes[tracked]
+        needed = np.zeros(len(tracked), np.bool_) if modes is None else np.asarray(np.isfinite(modes).any(axis=(1, 2)))
+        rows = apart(tracked, share, needed)
+        frames, told = tracked[rows], np.add.reduceat(share, np.append(0, rows[:-1] + 1))
+        choice = Choice(
+            self.tracker,
+            lambda k: self._pyramid(frames[k], LEVEL + 1),
+            frames,
+            np.diff(rows) == np.diff(frames),
+            self.poses[frames],
+            np.minimum(told, 1.0),
+            lambda done: self._advance(done * len(tracked) // len(frames)),
+        )
+        choice.decide(None if modes is None else modes[rows])
+        change = choice.poses - self.poses[frames]
+        place = np.interp(tracked, frames, np.arange(len(frames)))
+        self.poses[tracked] += change[np.round(place).astype(int)]
+        before, part = place.astype(int), (place % 1.0)[:, None]
+        after = np.minimum(before + 1, len(frames) - 1)
+        self._variance[1, tracked] = (1.0 - part) * choice.variance[before] + part * choice.variance[after]
 
     def _interpolate(self) -> None:
         """Set angles that only landmarks show between those of the frames in which two images or more have landmarks:
@@ -298,90 +218,6 @@ class SecondPass:
         seen = self.tracked[images > 1]
         for k in np.flatnonzero(self.tracker.body.skeleton.is_by_landmarks) if len(seen) else ():
             self.poses[self.tracked, k] = np.interp(self.tracked, seen, self.poses[seen, k])
-
-    def _track(self, alternatives: Sequence[Alternative], step: int) -> Tracks:
-        """Track alternatives forwards (``step`` 1) or backwards (-1) beside the present poses."""
-        order, result = self.tracked[::step], np.repeat(self.poses[None], len(alternatives), axis=0)
-        found, cost = np.zeros(result.shape[:2], bool), np.zeros(result.shape[:2])
-        mean = np.full(len(alternatives), np.nan)  # of the cost; NaN: none is tracked
-        pasts: list[Float | None] = [None] * len(alternatives)  # (D,) their poses in the frame before the last
-        for begin in range(0, len(order) - 1, AT_ONCE):
-            frames = order[begin + 1 : begin + 1 + AT_ONCE]
-            lasts, seen = order[begin : begin + len(frames)], cache(lambda i: self._pyramid(i, LEVEL + 1))
-            # most alternatives become the present pose at once: those that begin are settled together
-            starts = np.stack([self._starts(one, lasts, frames, step) for one in alternatives])
-            begun = self._settled(alternatives, starts, frames, seen)
-            self._advance(2 * len(frames))
-            for n, (last, i) in enumerate(zip(lasts.tolist(), frames.tolist(), strict=True)):
-                known, mean = mean, np.full(len(alternatives), np.nan)
-                if i != last + step:
-                    continue
-                present, poses = self.poses[i], begun[:, n]
-                if tracked := np.flatnonzero(np.isfinite(known)).tolist():
-                    some = [alternatives[k] for k in tracked]
-                    starts = np.repeat(present[None, None], len(some), axis=0)
-                    for start, k, one in zip(starts[:, 0], tracked, some, strict=True):
-                        start[one.dofs] = _predicted(result[k, last], pasts[k])[one.dofs]
-                    poses[tracked] = self._settled(some, starts, frames[n : n + 1], seen)[:, 0]
-                were_tracked = np.isfinite(known).tolist()
-                pasts = [self._past(*one, last) for one in zip(alternatives, result, were_tracked, strict=True)]
-                differ = np.flatnonzero((poses != present).any(axis=1))
-                if not len(differ):
-                    continue
-                pyramid = seen(i)
-                costs = self.tracker.cost(pyramid, np.concatenate([present[None], poses[differ]]))
-                more = costs[1:] - costs[0]
-                mean[differ] = np.where(np.isnan(known[differ]), more, known[differ] + RENEWAL * (more - known[differ]))
-                mean[mean > DROPPED] = np.nan
-                kept = differ[np.isfinite(mean[differ])]
-                # a limb behind other people costs nothing, and only the first pass sees its colours
-                hidden = SHARED * (pyramid.masks[0] == OTHERS).any()
-                result[kept, i], found[kept, i] = poses[kept], True
-                cost[kept, i] = self._share[i] * more[np.isfinite(mean[differ])] + hidden
-        return Tracks(result, found, cost)
-
-    def _starts(self, one: Alternative, lasts: NDArray[np.int64], frames: NDArray[np.int64], step: int) -> Float:
-        """Return the poses (N, D) from which an alternative begins in N frames; the present one where it does not."""
-        poses, follows = self.poses[frames], frames == lasts + step
-        if one.begins is not None:
-            angles = one.begins[frames][:, one.dofs]
-            known = np.flatnonzero(np.isfinite(angles).all(axis=1))
-            poses[np.ix_(known, one.dofs)] = angles[known]
-        else:
-            for n in np.flatnonzero(follows).tolist():
-                past = self.poses[lasts[n] - step] if lasts[n] - step in self._seen else None
-                poses[n, one.dofs] = _predicted(self.poses[lasts[n]], past)[one.dofs]
-        return poses
-
-    def _past(self, one: Alternative, poses: Float, tracked: bool, frame: int) -> Float | None:
-        """Return the pose (D,) in a frame of an alternative with poses (F, D), which was tracked there or begins in the
-        next frame; None if it is unknown."""
-        if tracked or one.begins is None:
-            return np.asarray(poses[frame])
-        return np.asarray(one.begins[frame]) if one.moves else None
-
-    def _settled(
-        self,
-        alternatives: Sequence[Alternative],
-        starts: Float,
-        frames: NDArray[np.int64],
-        seen: Callable[[int], Pyramid],
-    ) -> Float:
-        """Return what the starts (A, N, D) of alternatives converge to in N frames; the present pose where that, or the
-        start, is near the present pose."""
-        tracker, skeleton, present = self.tracker, self.tracker.body.skeleton, self.poses[frames]
-        joints, result = skeleton.joints(present), np.repeat(present[None], len(alternatives), axis=0)
-        far = skeleton.apart(starts, joints) > SAME_POSE_M
-        for limb in dict.fromkeys(one.limb for one in alternatives):  # those of a limb are settled together
-            own = far & np.array([one.limb is limb for one in alternatives])[:, None]
-            if own.any():
-                start, shown = starts[own], frames[np.nonzero(own)[1]]
-                pyramid = Pyramid.of_all([seen(i) for i in shown.tolist()], LEVEL)
-                prior = tracker.prior(start, ANGLE_DEG)
-                result[own] = tracker.settle(pyramid, start, (LEVEL,), prior=prior, limb=limb).states
-        if far.any():
-            result = np.where(skeleton.apart(result, joints)[..., None] > SAME_POSE_M, result, present)
-        return result
 
     def _advance(self, frames: int) -> None:
         """Report the share that is done: every frame is settled once, tracked in both directions, which takes as long
@@ -399,53 +235,6 @@ class SecondPass:
         if not used.all():
             shown = np.where(used[:, None, None], shown, np.uint8(0))
         return self.tracker.views.pyramid(shown, scales, False, in_frames(self._measured, i, used))
-
-
-def _predicted(pose: Float, past: Float | None) -> Float:
-    """Return the pose (D,) after a pose (D,) and the one before it; no motion if that is unknown."""
-    return pose if past is None else np.asarray(pose + VELOCITY * (pose - past))
-
-
-def _surprises(joints: Float, frames: NDArray[np.int64]) -> Float:
-    """Return (F, 2, 2, 2) how far a joint is from its prediction, metres, the joint for which this is most: in each of
-    two states, last axis, predicted from each state of two frames before and of the frame before.
-
-    Args:
-        joints: (2, F, J, 3) in the two states.
-        frames: (F,) their numbers. Anything may happen in lost frames; after them the velocity is not known.
-    """
-    result = np.zeros((joints.shape[1], 2, 2, 2))
-    steps = joints[None, :, 1:] - joints[:, None, :-1]
-    result[1:] = np.linalg.norm(steps, axis=-1).max(axis=-1).transpose(2, 0, 1)[:, None]
-    away = steps[None, :, :, 1:] - VELOCITY * steps[:, :, None, :-1]
-    follows = np.diff(frames) == 1
-    known = np.flatnonzero(follows[1:] & follows[:-1])
-    result[2 + known] = np.linalg.norm(away[..., known, :, :], axis=-1).max(axis=-1).transpose(3, 0, 1, 2)
-    result[1:][~follows] = 0.0
-    return result
-
-
-def second_of_two(cost: Float, steps: Float) -> Float:
-    """Return (F,) the probability of the second of two states in each of F frames, by the forward-backward algorithm
-    for pairs of states.
-
-    Args:
-        cost: (F,) negative logarithm of the second state's likelihood relative to the first's.
-        steps: (F, 2, 2, 2) negative logarithm of the probability of a frame's state, last axis, after those two frames
-            and one frame before it.
-    """
-    frame = np.stack([np.zeros_like(cost), cost], axis=1)
-    forward = np.zeros((len(cost), 2, 2))  # of the states of the frame before, and of the frame
-    backward = np.zeros_like(forward)
-    forward[0] = frame[0]
-    for k in range(1, len(cost)):
-        before = forward[k - 1, :, :, None] + steps[k]
-        forward[k] = frame[k] - np.logaddexp(-before[0], -before[1])
-    for k in range(len(cost) - 1, 0, -1):
-        after = steps[k] + frame[k] + backward[k]
-        backward[k - 1] = -np.logaddexp(-after[..., 0], -after[..., 1])
-    first, second = -np.logaddexp.reduce(-(forward + backward), axis=1).T
-    return np.asarray(1.0 / (1.0 + np.exp(np.clip(second - first, -500.0, 500.0))))
 
 
 def _steps(joints: Float) -> Float:

@@ -58,9 +58,7 @@ def edgels_all_over(body, count=400):
     row = rng.normal(size=(count, 3))
     nothing = np.zeros(count)
     first = nothing.astype(np.int32)
-    return Edgels(
-        first, first, part, unscaled, nothing, nothing, row, np.zeros((count, 2)), np.zeros((count, 2))
-    )
+    return Edgels(first, first, part, unscaled, nothing, nothing, row, np.zeros((count, 2)), np.zeros((count, 2)))
 
 
 EDGELS = edgels_all_over(AVERAGE)

@@ -65,14 +65,14 @@ def pose_of_joints(skeleton: Skeleton, rows: NDArray[np.int64], targets: Float) 
     start[:, :3] += targets.mean(axis=0) - skeleton.joints(start[0])[rows].mean(axis=0)
     D = start.shape[1]
     precision = np.where(skeleton.prismatic, 0.0, np.pi**-2.0)  # half a turn, for what the joints leave open
-    weight = np.full(3 * len(rows), _JOINT_M**-2.0)
 
     def linearise(poses: Float, _: int) -> Equations:
         found = Equations(len(poses), D, 0)
+        missing = targets - skeleton.joints(poses)[:, rows]
+        J = skeleton.joint_jacobian(poses)[:, rows].reshape(missing.size, D)
+        blocks = np.repeat(np.arange(len(poses)), missing[0].size)
+        found.add(blocks, np.arange(D), J, np.full(missing.size, _JOINT_M**-2.0), missing.ravel())
         for b, pose in enumerate(poses):
-            J = skeleton.joint_jacobian(pose)[rows].reshape(-1, D)
-            missing = targets - skeleton.joints(pose)[rows]
-            found.add(b, [slice(0, D)], J, weight, missing.ravel())
             found.add_block_prior(b, precision, start[b] - pose)
             excess = skeleton.clip(pose) - pose
             found.add_block_prior(b, np.where(excess != 0, _LIMIT, 0.0), excess)

@@ -191,7 +191,7 @@ class ContourBundle:
         velocity = np.array([frame.velocity for frame in self.frames])
         ends = np.searchsorted(edgels.part, np.arange(len(segments) + 1)).tolist()
         for part, own in enumerate(starmap(slice, pairwise(ends))):  # a part depends on few of the unknowns
-            some, frame = edgels.of(own), contours.frame[own]
+            some, at = edgels.of(own), contours.frame[own]
             dofs, by_pose = linear.pose_rows(part, some, x[own])
             parameters, by_parameter = linear.parameter_rows(part, some)
             rows, columns = [by_pose, by_parameter], [dofs, D + self.cameras.stop + parameters]
@@ -200,11 +200,11 @@ class ContourBundle:
                 columns.append(P + 3 * segments[part] + np.arange(3))
             if self.parameters:
                 if "offset" in self.parameters:
-                    by_delay = (by_pose * velocity[frame][:, dofs]).sum(axis=1)
-                    by_camera[own][np.arange(len(frame)), some.view, -1] = by_delay
-                rows.append(by_camera[own].reshape(len(frame), -1))
+                    by_delay = (by_pose * velocity[at][:, dofs]).sum(axis=1)
+                    by_camera[own][np.arange(len(at)), some.view, -1] = by_delay
+                rows.append(by_camera[own].reshape(len(at), -1))
                 columns.append(D + np.arange(self.cameras.stop))
-            found.add(frame, np.concatenate(columns), np.hstack(rows), weight[own], some.distance)
+            found.add(at, np.concatenate(columns), np.hstack(rows), weight[own], some.distance)
         marked = [f for f, frame in enumerate(self.frames) if MARKED in frame.pyramid.measured]
         if marked:
             # a network's depth is too cautious, by an unknown share: it says nothing about the body's lengths
@@ -235,7 +235,10 @@ class ContourBundle:
     def _camera_rows(self, rig: Rig, x_world: Float, edgels: Edgels) -> Float:
         """Return the derivatives (N, C, k) of the contours' positions by the parameters of the cameras, those by
         "offset" zero, at the points (N, 3) of edgels."""
-        result, names = np.zeros((len(x_world), len(rig), len(self.sigma))), [p for p in self.parameters if p != "offset"]
+        result, names = (
+            np.zeros((len(x_world), len(rig), len(self.sigma))),
+            [p for p in self.parameters if p != "offset"],
+        )
         for c, camera in enumerate(rig) if names else ():
             own = np.flatnonzero(edgels.view == c)
             rows = np.hstack([camera_rows(camera, x_world[own], edgels.of(own), name) for name in names])
