@@ -283,12 +283,12 @@ def apart(frames: NDArray[np.int64], share: Float, needed: NDArray[np.bool_]) ->
     """
     ends = np.append(np.diff(frames) != 1, True)
     must = needed | ends | np.append(True, ends[:-1])
-    chosen, told = [], 0.0
+    chosen, said = [], 0.0
     for n, following in enumerate(np.append(share[1:], 0.0).tolist()):
-        told += share[n]
-        if must[n] or told + following > APART:
+        said += share[n]
+        if must[n] or said + following > APART:
             chosen.append(n)
-            told = 0.0
+            said = 0.0
     return np.array(chosen, np.int64)
 
 

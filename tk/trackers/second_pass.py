@@ -191,14 +191,14 @@ class SecondPass:
         modes = None if self._modes is None else self._modes[tracked]
         needed = np.zeros(len(tracked), np.bool_) if modes is None else np.asarray(np.isfinite(modes).any(axis=(1, 2)))
         rows = apart(tracked, share, needed)
-        frames, told = tracked[rows], np.add.reduceat(share, np.append(0, rows[:-1] + 1))
+        frames, said = tracked[rows], np.add.reduceat(share, np.append(0, rows[:-1] + 1))
         choice = Choice(
             self.tracker,
             lambda k: self._pyramid(frames[k], LEVEL + 1),
             frames,
             np.diff(rows) == np.diff(frames),
             self.poses[frames],
-            np.minimum(told, 1.0),
+            np.minimum(said, 1.0),
             lambda done: self._advance(done * len(tracked) // len(frames)),
         )
         choice.decide(None if modes is None else modes[rows])
