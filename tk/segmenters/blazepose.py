@@ -30,7 +30,8 @@ _LOADING = threading.Lock()
 # The detector's anchors: cells per side of each grid, and anchors per cell (MediaPipe's pose_detection_cpu.pbtxt:
 # strides 8, 16, 32, 32, 32, two anchors each).
 _GRIDS = ((28, 2), (14, 2), (7, 6))
-_HIPS, _CIRCLE = slice(4, 6), slice(6, 8)  # columns: mid-hip point, point on the circle around the body
+# columns: middle and size of the box, mid-hip point, point on the circle around the body
+_BOX, _SIZE, _HIPS, _CIRCLE = (slice(k, k + 2) for k in range(0, 8, 2))
 _LEAST_SCORE = 0.5  # MediaPipe's value
 # Least probability that the square shows a person. Of people who hide each other, landmarks with 0.24 are right.
 _LEAST_PRESENT = 0.05
@@ -44,9 +45,9 @@ _ROWS = {
     "elbow_r": 14, "wrist_l": 15, "wrist_r": 16, "hip_l": 23, "hip_r": 24, "knee_l": 25, "knee_r": 26, "ankle_l": 27,
     "ankle_r": 28, "heel_l": 29, "heel_r": 30, "toe_l": 31, "toe_r": 32,
 }  # fmt: skip
-# Detections whose mid-hip points differ by less than this share of the radius are one person. Detections of one person
-# differ by far less, different people by more.
-_SAME = 0.5
+# Detections whose boxes, which hold the head, overlap by more (intersection over union) are one person: MediaPipe's
+# value. People who dance together have heads apart.
+_SAME = 0.3
 
 
 class BlazePose:
@@ -86,19 +87,14 @@ class BlazePose:
         scores = 1 / (1 + np.exp(-np.clip(logits[:, 0].astype(np.float64), -100, 100)))
         sure = np.flatnonzero(scores >= _LEAST_SCORE)
         sure = sure[np.argsort(-scores[sure], kind="stable")]
-        hips, circle = (
-            (rows[sure, part] + self._anchors[sure] * _DETECTOR_SIDE) / scale - 0.5 for part in (_HIPS, _CIRCLE)
-        )
+        anchors = self._anchors[sure] * _DETECTOR_SIDE
+        box, hips, circle = ((rows[sure, part] + anchors) / scale - 0.5 for part in (_BOX, _HIPS, _CIRCLE))
         weight, people = scores[sure], []
-        while len(hips):
-            # MediaPipe's weighted non-maximum suppression, here on the mid-hip points
-            radius = float(np.linalg.norm(circle[0] - hips[0]))
-            same = np.linalg.norm(hips - hips[0], axis=1) <= _SAME * radius
+        for same in suppressed(box, rows[sure, _SIZE] / scale):
             share = weight[same, None] / weight[same].sum()
             x, y = (share * hips[same]).sum(axis=0)
             u, v = (share * circle[same]).sum(axis=0)
-            people.append(Sighting((float(x), float(y)), (float(u), float(v)), float(weight[0])))
-            hips, circle, weight = hips[~same], circle[~same], weight[~same]
+            people.append(Sighting((float(x), float(y)), (float(u), float(v)), float(weight[same[0]])))
         return people
 
     def segment(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -143,6 +139,20 @@ class _Network:
         self._interpreter.set_tensor(self._input, image[None].astype(np.float32))
         self._interpreter.invoke()
         return [self._interpreter.get_tensor(index) for index in self._outputs]
+
+
+def suppressed(middle: NDArray[np.floating], size: NDArray[np.floating]) -> list[NDArray[np.int64]]:
+    """Return the rows of each person's detections, the best first, by non-maximum suppression of boxes with these
+    middles and sizes (N, 2), the most certain first."""
+    low, high = middle - size / 2, middle + size / 2
+    left, area, people = np.arange(len(middle)), size.prod(axis=1), []
+    while len(left):
+        first = left[0]
+        common = np.maximum(np.minimum(high[left], high[first]) - np.maximum(low[left], low[first]), 0.0).prod(axis=1)
+        same = (common > _SAME * (area[left] + area[first] - common)) | (left == first)
+        people.append(left[same])
+        left = left[~same]
+    return people
 
 
 def _probability(logit: NDArray[Any]) -> NDArray[Any]:

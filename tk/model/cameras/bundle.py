@@ -202,7 +202,7 @@ class ContourBundle:
                 if "offset" in self.parameters:
                     by_delay = (by_pose * velocity[at][:, dofs]).sum(axis=1)
                     by_camera[own][np.arange(len(at)), some.view, -1] = by_delay
-                rows.append(by_camera[own].reshape(len(at), -1))
+                rows.append(by_camera[own].reshape(len(at), self.cameras.stop))
                 columns.append(D + np.arange(self.cameras.stop))
             found.add(at, np.concatenate(columns), np.hstack(rows), weight[own], some.distance)
         marked = [f for f, frame in enumerate(self.frames) if MARKED in frame.pyramid.measured]
