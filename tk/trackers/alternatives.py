@@ -177,27 +177,25 @@ class Choice:
         """Track alternatives forwards (``step`` 1) or backwards (-1) beside the present poses."""
         order, result = np.arange(len(self.poses))[::step], np.repeat(self.poses[None], len(alternatives), axis=0)
         found, cost = np.zeros(result.shape[:2], bool), np.zeros(result.shape[:2])
-        mean = np.full(len(alternatives), np.nan)  # of the cost; NaN: none is tracked
+        mean = nothing = np.full(len(alternatives), np.nan)  # of the cost; NaN: none is tracked
         pasts: list[Float | None] = [None] * len(alternatives)  # (D,) their poses in the frame before the last
-        for begin in range(1, len(order), AT_ONCE):
+        for begin in range(0, len(order), AT_ONCE):
             frames, seen = order[begin : begin + AT_ONCE], cache(self._shown)
             # most alternatives become the present pose at once: those that begin are settled together
             starts = np.stack([self._starts(one, frames, step) for one in alternatives])
             begun = self._settled(alternatives, starts, frames, seen)
             self._advance(2 * len(frames))
             for n, i in enumerate(frames.tolist()):
-                known, mean = mean, np.full(len(alternatives), np.nan)
-                if not self._joined(i, step):
-                    continue
-                last, present, poses = i - step, self.poses[i], begun[:, n]
+                joined, last, present, poses = self._joined(i, step), i - step, self.poses[i], begun[:, n]
+                known, mean = mean if joined else nothing, nothing.copy()
                 if tracked := np.flatnonzero(np.isfinite(known)).tolist():
                     some = [alternatives[k] for k in tracked]
                     starts = np.repeat(present[None, None], len(some), axis=0)
                     for start, k, one in zip(starts[:, 0], tracked, some, strict=True):
                         start[one.dofs] = self._predicted(i, step, result[k, last], pasts[k])[one.dofs]
                     poses[tracked] = self._settled(some, starts, frames[n : n + 1], seen)[:, 0]
-                were_tracked = np.isfinite(known).tolist()
-                pasts = [self._past(*one, last) for one in zip(alternatives, result, were_tracked, strict=True)]
+                each = zip(alternatives, result, np.isfinite(known).tolist(), strict=True)
+                pasts = [self._past(*one, last) if joined else None for one in each]
                 differ = np.flatnonzero((poses != present).any(axis=1))
                 if not len(differ):
                     continue
