@@ -183,8 +183,8 @@ class Skeleton:
         steps[..., :3, 3] = np.where(
             self.prismatic[:, None], self.axis * pose[..., None], self.point - (R @ self.point[:, :, None])[..., 0]
         )
-        for k in self._raised:
-            steps[..., k, :3, 3] += self.rise[k] * arm_elevation(pose[..., k], pose[..., k + 1])[..., None]
+        k = self._raised
+        steps[..., :3, 3][..., k, :] += self.rise[k] * arm_elevation(pose[..., k], pose[..., k + 1])[..., None]
         steps[..., 3, 3] = 1.0
         result = steps
         # calls take most of the time of few poses, products that of many
@@ -226,10 +226,10 @@ class Skeleton:
         # the joint's place, its rise included, does not move when it turns
         q = (T[..., :3, :3] @ self.point[:, :, None])[..., 0] + T[..., :3, 3]
         v = np.where(self.prismatic[:, None], axis, cross(q, axis))
-        for k in self._raised:
-            lift = above[..., k, :3, :3] @ self.rise[k]
-            for by in (0, 1):
-                v[..., k + by, :] += lift * arm_elevation(pose[..., k], pose[..., k + 1], by=by)[..., None]
+        k = self._raised
+        lift = (above[..., k, :3, :3] @ self.rise[k][..., None])[..., 0]
+        for by in (0, 1):
+            v[..., k + by, :] += lift * arm_elevation(pose[..., k], pose[..., k + 1], by=by)[..., None]
         return np.where(self.prismatic[:, None], 0.0, axis), v
 
     def rotation(self, dofs: Iterable[int], poses: Float) -> Float:
