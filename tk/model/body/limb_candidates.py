@@ -63,14 +63,13 @@ class Limb:
         return np.asarray(poses[best[chosen]])
 
 
-def distinct(joints: Float, count: int, least_m: float = DISTINCT_M) -> list[int]:
-    """Return the indices of the first ``count`` positions (N, J, 3) that differ from each other by more than
-    ``least_m`` in a joint, metres."""
+def distinct(joints: Float, count: int) -> list[int]:
+    """Return the indices of the first positions (N, J, 3) that differ from each other by :data:`DISTINCT_M`."""
     free = np.ones(len(joints), np.bool_)
     chosen: list[int] = []
     while len(chosen) < count and free.any():
         chosen.append(int(np.argmax(free)))
-        free &= np.linalg.norm(joints - joints[chosen[-1]], axis=-1).max(axis=-1) > least_m
+        free &= np.linalg.norm(joints - joints[chosen[-1]], axis=-1).max(axis=-1) > DISTINCT_M
     return chosen
 
 

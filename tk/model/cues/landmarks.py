@@ -31,7 +31,6 @@ from tk.model.body.body_points import LANDMARKS, POINTS, SEGMENT, places
 from tk.model.body.cone_body import ConeBody
 from tk.model.body.initial_pose import figures
 from tk.model.body.joints import HIPS, JOINTS, SHOULDERS, side_of
-from tk.model.body.limb_candidates import distinct
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.triangulation import triangulate_joints
 from tk.model.setup import AVERAGE_STATURE_M
@@ -62,8 +61,6 @@ LEAST_VISIBLE, LEAST_OVERLAP = 0.2, 0.2
 # Factors of the standard deviations with which a proposal minimises the landmarks' cost, two steps each: a pose that
 # is far away is attracted, too. Largest change of an angle in a step, radians.
 WIDENED, LONGEST_STEP = (16.0, 8.0, 4.0, 2.0, 1.0), 0.6
-# Poses on the way to a minimum whose joints all differ by less, metres, go to the same one: as for hypotheses.
-MERGED_M = 0.05
 # Weight of the landmarks in the contours' equations: these count the edgels of a segment as independent, but clothes
 # and wrong pieces of a mask displace all of them together.
 WEIGHT = 5.0
@@ -414,8 +411,6 @@ def propose(rig: Rig, body: ConeBody, seen: Float, p_near: Float) -> Float:
             cost = cue.normal(poses) + prior
             step = np.linalg.solve(cost.matrix, cost.linear[..., None])[..., 0] - poses
             poses = skeleton.clip(poses + np.clip(step, -LONGEST_STEP, LONGEST_STEP))
-        kept = distinct(skeleton.joints(poses), len(poses), MERGED_M)
-        poses, prior = poses[kept], Quadratic(prior.linear[kept], prior.matrix)
     return np.asarray(poses[np.argsort(cue.cost(poses), kind="stable")])
 
 
