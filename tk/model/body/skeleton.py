@@ -52,7 +52,7 @@ __all__ = ["CHAINS", "JOINTS", "SEGMENTS"]
 Float = NDArray[np.float64]
 
 # Batches of few poses whose transforms are kept, and how many poses a batch has at most.
-REMEMBERED, REMEMBERED_POSES = 8, 32
+REMEMBERED, REMEMBERED_POSES = 32, 32
 # Poses of a recording that are placed at once: a pose needs 16 kB of temporary memory.
 _BLOCK = 1024
 # Up to so many poses are placed in few rounds of products, more of them with few products: a call takes as long as
