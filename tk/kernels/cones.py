@@ -12,7 +12,7 @@ A curve is one of these pieces; u in [0, 1] runs along it.
 """
 
 from tk.kernels.runtime import ti
-from tk.kernels.vectors import cross, dot, norm_sqr
+from tk.kernels.vectors import cross, norm_sqr
 
 CONE, ELLIPSOID = range(2)
 # kinds of curves: the two generators, the rims at z = 0 and z = h, the outline of an ellipsoid
@@ -134,13 +134,13 @@ def enclosing_radius(part_kind: int, shape):
 
 @ti.func
 def enter(part_kind: int, shape, c, d, shrink):
-    """Return t > 0 where the ray c + t d enters a part; -1 if it misses. ``shrink`` scales the cross-section."""
+    """Return t > 0 where the ray c + t d enters a part; -1 if it misses. ``shrink``, at most 1, scales the
+    cross-section."""
     result = -1.0 + 0.0 * d[0]
-    middle = interior_point(part_kind, shape) - c
-    reach = enclosing_radius(part_kind, shape)
-    along = dot(middle, d)
-    dd = norm_sqr(d)
-    if along > 0.0 and norm_sqr(middle) * dd - along * along < reach * reach * dd:
+    _, _, radius = capsule(part_kind, shape)
+    # most rays near a part pass its axis at more than its radius
+    apart = c[0] * d[1] - c[1] * d[0]
+    if apart * apart <= radius * radius * (d[0] * d[0] + d[1] * d[1]):
         size = extent(part_kind, shape, shrink)
         result = enter_unit(part_kind, shape[3], c / size, d / size)
     return result

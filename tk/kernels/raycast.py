@@ -375,12 +375,9 @@ def _launch(
         np.array((rays.step, most_outside, met is not None), dtype),
         spread_of(B),
         poses,
-        np.empty((B, D, JOINT_NUMBERS), dtype),
-        np.empty((B, P, 12), dtype),
-        np.empty((B, V, P, _COLUMNS), dtype),
-        np.empty((B, len(drawn), 2), np.int32),
+        *_scratch(B, V, D, P, dtype),
         change,
-        *(met or (np.empty((1, 1, 1, 1), np.uint8), np.empty((1, 1, 1, 1), np.float32))),
+        *(met or _no_cast()),
     )
     if before.label.any():
         column = np.minimum(body.parts[:, PART_GROUP].astype(np.intp) + 1, cost.shape[3] - 1)
@@ -390,6 +387,21 @@ def _launch(
     else:
         base = cost[..., 0].sum(axis=(1, 2), dtype=np.float64)
     return np.asarray(base + change)
+
+
+@functools.lru_cache(8)
+def _scratch(B: int, V: int, D: int, P: int, dtype: np.dtype) -> tuple[NDArray, ...]:
+    return (
+        np.empty((B, D, JOINT_NUMBERS), dtype),
+        np.empty((B, P, 12), dtype),
+        np.empty((B, V, P, _COLUMNS), dtype),
+        np.empty((B, P, 2), np.int32),
+    )
+
+
+@functools.cache
+def _no_cast() -> Cast:
+    return Cast(np.empty((1, 1, 1, 1), np.uint8), np.empty((1, 1, 1, 1), np.float32))
 
 
 def _above(body: ConeArrays, drawn: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -139,7 +139,7 @@ def test_unknown_depth_changes_nothing_and_depth_moves_left_and_right_with_the_l
     assert other - own < INDEPENDENT * 2 * len(RIG) * np.log((1 - EXCHANGED) / EXCHANGED) + 1e-6
     seen[..., 3] = np.nan
     rows = LandmarkCue(RIG, BODY, seen).rows(pose)
-    assert not rows.information[:, len(LANDMARKS) :].any() and not rows.pull[:, len(LANDMARKS) :].any()
+    assert not rows.information[..., len(LANDMARKS) :].any() and not rows.pull[..., len(LANDMARKS) :].any()
 
 
 def test_head_turns_to_where_the_face_is_seen_and_is_straight_without_it() -> None:

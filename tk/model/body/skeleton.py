@@ -51,8 +51,8 @@ __all__ = ["CHAINS", "JOINTS", "SEGMENTS"]
 
 Float = NDArray[np.float64]
 
-# Single poses whose transforms are kept.
-REMEMBERED = 8
+# Batches of few poses whose transforms are kept, and how many poses a batch has at most.
+REMEMBERED, REMEMBERED_POSES = 32, 32
 # Poses of a recording that are placed at once: a pose needs 16 kB of temporary memory.
 _BLOCK = 1024
 # Up to so many poses are placed in few rounds of products, more of them with few products: a call takes as long as
@@ -158,13 +158,13 @@ class Skeleton:
     def transforms(self, pose: Float) -> Float:
         """Return the transforms T_k (..., D, 4, 4) after each degree of freedom of poses (..., D), float64."""
         pose = np.asarray(pose, dtype=np.float64)
-        if pose.size != pose.shape[-1]:
+        if pose.size > REMEMBERED_POSES * pose.shape[-1]:
             return self._transforms(pose)
-        # joints, twists and directions of one pose are asked for in turn, and the joints once more in the next frame
+        # joints, twists and directions of poses are asked for in turn, and the joints once more in the next frame
         key = pose.tobytes()
         placed = self._placed.get(key)
         if placed is None:
-            placed = self._transforms(pose.reshape(-1))
+            placed = self._transforms(pose.reshape(-1, pose.shape[-1]))
             placed.flags.writeable = False
             if len(self._placed) >= REMEMBERED:
                 self._placed.pop(next(iter(self._placed)), None)
@@ -183,8 +183,8 @@ class Skeleton:
         steps[..., :3, 3] = np.where(
             self.prismatic[:, None], self.axis * pose[..., None], self.point - (R @ self.point[:, :, None])[..., 0]
         )
-        for k in self._raised:
-            steps[..., k, :3, 3] += self.rise[k] * arm_elevation(pose[..., k], pose[..., k + 1])[..., None]
+        k = self._raised
+        steps[..., :3, 3][..., k, :] += self.rise[k] * arm_elevation(pose[..., k], pose[..., k + 1])[..., None]
         steps[..., 3, 3] = 1.0
         result = steps
         # calls take most of the time of few poses, products that of many
@@ -226,10 +226,10 @@ class Skeleton:
         # the joint's place, its rise included, does not move when it turns
         q = (T[..., :3, :3] @ self.point[:, :, None])[..., 0] + T[..., :3, 3]
         v = np.where(self.prismatic[:, None], axis, cross(q, axis))
-        for k in self._raised:
-            lift = above[..., k, :3, :3] @ self.rise[k]
-            for by in (0, 1):
-                v[..., k + by, :] += lift * arm_elevation(pose[..., k], pose[..., k + 1], by=by)[..., None]
+        k = self._raised
+        lift = (above[..., k, :3, :3] @ self.rise[k][..., None])[..., 0]
+        for by in (0, 1):
+            v[..., k + by, :] += lift * arm_elevation(pose[..., k], pose[..., k + 1], by=by)[..., None]
         return np.where(self.prismatic[:, None], 0.0, axis), v
 
     def rotation(self, dofs: Iterable[int], poses: Float) -> Float:
@@ -279,9 +279,10 @@ class Skeleton:
         for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
             generators[..., i, j], generators[..., i, k] = -w[..., k], w[..., j]
         generators[..., 3] = v
-        flat = generators.reshape(*w.shape[:-2], -1, 4)
-        moved = flat[..., :3] @ np.swapaxes(points, -1, -2) + flat[..., 3:]  # (..., 3 D, N)
-        moved = moved.reshape(*w.shape, -1) * self.ancestors[segment].T[:, None]
+        extended = np.ones((*points.shape[:-2], 4, points.shape[-2]))
+        extended[..., :3, :] = np.swapaxes(points, -1, -2)
+        moved = (generators.reshape(*w.shape[:-2], -1, 4) @ extended).reshape(*w.shape, -1)  # (..., D, 3, N)
+        moved *= self.ancestors[segment].T[:, None]
         return np.moveaxis(moved, -1, -3).swapaxes(-1, -2)
 
     @cached_property

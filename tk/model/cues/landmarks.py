@@ -19,6 +19,7 @@ landmarks it stays as it is.
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cached_property
 from typing import NamedTuple
 
@@ -79,6 +80,10 @@ _BONES = [("shoulder_l", "shoulder_r"), ("hip_l", "hip_r")] + [
 _FROM, _TO = np.array([[LANDMARKS.index(name) for name in bone] for bone in _BONES]).T
 _BONE_HALVES = _HALVES[:, _FROM]  # (2, K)
 _SHARE = np.where(np.arange(len(_BONES)) < 2, *DEPTH_SHARE)  # (K,)
+# (L + K, L) the landmarks and their bones as sums of landmarks; (L + K, L L) the products of these sums' factors.
+_PLACES = np.eye(len(LANDMARKS))
+_PLACES = np.concatenate([_PLACES, _SHARE[:, None] * (_PLACES[_TO] - _PLACES[_FROM])])
+_PAIRS = (_PLACES[:, :, None] * _PLACES[:, None, :]).reshape(len(_PLACES), -1)
 # The landmarks that show each joint.
 _FACE = tuple(name for name in LANDMARKS if POINTS[name].segment == "head")
 _MIDDLE = {"pelvis": HIPS, "neck": SHOULDERS, "head_top": _FACE}
@@ -103,20 +108,21 @@ class _Match(NamedTuple):
 
 
 class LandmarkRows(NamedTuple):
-    """Information of the landmarks about L points and K bones of the body at B poses, with the landmarks' offsets
-    integrated out."""
+    """Information of the landmarks about N = L + K places, the body's points and its bones (:func:`_with_bones`), at B
+    poses, with the landmarks' offsets integrated out."""
 
-    information: Float  # (B, L + K, 3, 3) about each point, and each bone as :func:`_with_bones` has it, 1/m²
-    pull: Float  # (B, L + K, 3) the same times the distance to the landmarks, 1/m
+    information: Float  # (B, 3, 3, N) 1/m²
+    pull: Float  # (B, 3, N) the same times the distance to the landmarks, 1/m
     jacobian: Float  # (B, L, 3, D) derivatives of the points by the pose
 
     def normal_equations(self, jacobian: Float) -> tuple[Float, Float]:
         """Return JᵀWJ (B, K, K) and JᵀW times the distances (B, K) of unknowns with derivatives (B, L, 3, K)."""
-        jacobian = _with_bones(jacobian)
-        B, N, _, K = jacobian.shape
-        rows = jacobian.reshape(B, 3 * N, K).swapaxes(1, 2)
-        weighted = (self.information @ jacobian).reshape(B, 3 * N, K)
-        return rows @ weighted, (rows @ self.pull.reshape(B, 3 * N, 1))[..., 0]
+        B, L, _, K = jacobian.shape
+        rows = jacobian.transpose(0, 3, 2, 1).reshape(B, K, 3 * L)
+        # a bone joins two points
+        matrix = (self.information.reshape(9 * B, -1) @ _PAIRS).reshape(B, 3, 3, L, L)
+        matrix = matrix.swapaxes(2, 3).reshape(B, 3 * L, 3 * L)
+        return rows @ (matrix @ rows.swapaxes(1, 2)), (rows @ (self.pull @ _PLACES).reshape(B, 3 * L, 1))[..., 0]
 
 
 class LandmarkCue:
@@ -127,20 +133,19 @@ class LandmarkCue:
         body: the person's body.
         seen: (V, L, 4) or (F, V, L, 4), x, y, pixels, visibility, and depth, metres behind the middle of the hips; NaN
             if unknown. Of F frames: as many as poses.
-        widened: factor of the landmarks' standard deviations. If it exceeds 1, all images show the person.
     """
 
     weight = WEIGHT
 
-    def __init__(self, rig: Rig, body: ConeBody, seen: Float, widened: float = 1.0) -> None:
+    def __init__(self, rig: Rig, body: ConeBody, seen: Float) -> None:
         self._rig, self._skeleton, self._seen = rig, body.skeleton, seen
-        self._elsewhere = float(np.log(ELSEWHERE)) if widened == 1.0 else -np.inf
+        self._elsewhere, self._precision = float(np.log(ELSEWHERE)), 1.0
         seen = _normalised(rig, seen)
         self._place = places(body.dimensions) @ body.skeleton.T_world_body.T
         self._size = size = body.dimensions.stature / AVERAGE_STATURE_M
         known = known_landmarks(seen)
         visibility = np.where(known, seen[..., 2], 0.0)
-        self._sigma = widened * SEEN_M * size * HIDDEN ** (1.0 - visibility)  # (..., V, L)
+        self._sigma = SEEN_M * size * HIDDEN ** (1.0 - visibility)  # (..., V, L)
         self._right = np.where(known, right_share(visibility), 0.0)
         self._at = np.where(known[..., None], seen[..., :2], 0.0)
         # what is hidden in the images is guessed in all of them alike
@@ -149,9 +154,16 @@ class LandmarkCue:
         offset = (OFFSET_M * size * HIDDEN ** (1.0 - mean)) ** 2
         self._offset = np.concatenate([offset, _SHARE**2 * (offset[..., _FROM] + offset[..., _TO])], axis=-1)
         self._depth = np.where(known, seen[..., 3], np.nan)
-        self._visibility, self._widened = visibility, widened
+        self._visibility = visibility
         # (D,) or (F, D) precision of the angles that only landmarks show, where there are any
         self._prior = np.any(known, axis=(-2, -1))[..., None] * body.skeleton.by_landmarks**-2.0
+
+    def widened(self, factor: float) -> LandmarkCue:
+        """Return the cue with standard deviations times a factor; if it exceeds 1, all images show the person."""
+        result = copy(self)
+        result._elsewhere = float(np.log(ELSEWHERE)) if factor == 1.0 else -np.inf
+        result._precision = factor**-2
+        return result
 
     @cached_property
     def _sight(self) -> Float:
@@ -181,19 +193,20 @@ class LandmarkCue:
         depth, visibility = (np.stack([v, v[..., _PARTNER]], axis=-3) for v in (self._depth, self._visibility))
         seen = self._size * (depth[..., _TO] - depth[..., _FROM])
         known, visibility = np.isfinite(seen), np.minimum(visibility[..., _TO], visibility[..., _FROM])
-        sigma = self._widened * DEPTH_M * self._size * DEPTH_HIDDEN ** (1.0 - visibility)
+        sigma = DEPTH_M * self._size * DEPTH_HIDDEN ** (1.0 - visibility)
         return np.where(known, seen, 0.0), np.where(known, right_share(visibility), 0.0), sigma**-2
 
     @cached_property
     def _directions(self) -> tuple[Float, Float]:
-        """(4 V, 9), (..., V, 9) what the information about a point is linear in: see :meth:`_information`."""
+        """(9, 4 V), (..., 9, V) what the information about a point is linear in: see :meth:`_information`."""
         x, y, z = np.swapaxes(self._cameras[0], 0, 1)  # (V, 3) each
 
         def product(a: Float, b: Float) -> Float:
             return (a[..., :, None] * b[..., None, :]).reshape(*a.shape[:-1], 9)
 
         across = [product(x, x) + product(y, y), -product(x, z) - product(z, x), -product(y, z) - product(z, y)]
-        return np.concatenate([*across, product(z, z)]), product(self._sight, self._sight)
+        along = product(self._sight, self._sight)
+        return np.concatenate([*across, product(z, z)]).T.copy(), np.ascontiguousarray(along.swapaxes(-1, -2))
 
     def normal(self, poses: Float) -> Quadratic:
         """Return the negative logarithm of the likelihood, and of the prior of the angles that only landmarks show, as
@@ -206,10 +219,11 @@ class LandmarkCue:
     def rows(self, poses: Float) -> LandmarkRows:
         """Return the information of the landmarks about the body's points at poses (B, D)."""
         x = self._skeleton.points(poses, SEGMENT, self._place)
-        found, pull = self._information(x)[1:]
-        inverse = INDEPENDENT * _inverse(np.eye(3) + self._offset[..., None, None] * found)[0]
+        found, pull = self._information(x.swapaxes(1, 2))[1:]
+        inverse = INDEPENDENT * _inverse_with(found, self._offset)[0]
         jacobian = self._skeleton.point_jacobian(poses, SEGMENT, x)
-        return LandmarkRows(inverse @ found, (inverse @ pull[..., None])[..., 0], jacobian)
+        # both are symmetric and commute
+        return LandmarkRows(_product(inverse[:, None], found), _product(inverse, pull), jacobian)
 
     def cost(self, poses: Float) -> Float:
         """Return (B,) the same at poses (B, D), nats, up to a constant of the frame.
@@ -217,11 +231,12 @@ class LandmarkCue:
         The offsets are integrated out by Laplace's method, about the offsets that one step of Newton's gives. They
         explain what all images have in common; a landmark far off in one image is not explained by them.
         """
-        x, L = self._skeleton.points(poses, SEGMENT, self._place), len(LANDMARKS)
+        x, L = self._skeleton.points(poses, SEGMENT, self._place).swapaxes(1, 2), len(LANDMARKS)
         cost, information, pull = self._information(x)
-        variance = self._offset[..., :L, None]
-        inverse, determinant = _inverse(np.eye(3) + variance[..., None] * information[:, :L])
-        offset = variance * (inverse @ pull[:, :L, :, None])[..., 0]
+        variance = self._offset[..., :L]
+        inverse, determinant = _inverse_with(information[..., :L], variance)
+        variance = variance[..., None, :]
+        offset = variance * _product(inverse, pull[..., :L])
         moved = self._likelihood(x + offset)[0] + 0.5 * (offset**2 / variance).sum(axis=(-2, -1))
         volume = 0.5 * np.log(determinant).sum(axis=-1)
         # where the step leaves a landmark's normal part, it is too long, and no offset is better
@@ -247,39 +262,37 @@ class LandmarkCue:
         return np.stack([excess[:, rows].mean(axis=1) for rows in _MARKED.values()], axis=1)
 
     def _information(self, x: Float) -> tuple[Float, Float, Float]:
-        """Return the landmarks' likelihood if the body's points are at x (B, L, 3): its negative logarithm (B,), if all
-        landmarks were independent; the information (B, L + K, 3, 3) about each point and each bone, and its product
-        (B, L + K, 3) with the distance to the landmarks.
+        """Return the landmarks' likelihood if the body's points are at x (B, 3, L): its negative logarithm (B,), if all
+        landmarks were independent; the information (B, 3, 3, L + K) about each point and each bone, and its product
+        (B, 3, L + K) with the distance to the landmarks.
 
         An image shows a point's position across the ray: with the point at (u, v) on the plane at distance 1, the
         derivatives are the rows (1, 0, -u) and (0, 1, -v) in the camera's frame.
         """
-        (B, L, _), V = x.shape, len(self._rig)
+        (B, _, L), V = x.shape, len(self._rig)
         cost, q, marks, depths, named = self._likelihood(x)
         w = named @ _HALVES * marks.right * marks.weight  # (B, 2, V, L)
         u, v = q[:, :, 0] / q[:, :, 2], q[:, :, 1] / q[:, :, 2]
-        total, (pull_x, pull_y) = w.sum(axis=1), ((w * away).sum(axis=1) for away in marks.away)
+        total, (pull_x, pull_y) = w[:, 0] + w[:, 1], ((w * away).sum(axis=1) for away in marks.away)
         moments = np.stack([total, total * u, total * v, total * (u * u + v * v)], axis=1)  # (B, 4, V, L)
         across, along = self._directions
-        information = np.swapaxes(moments.reshape(B, 4 * V, L), 1, 2) @ across
         pulls = np.stack([pull_x, pull_y, -u * pull_x - v * pull_y], axis=2).reshape(B, 3 * V, L)
-        pull = np.swapaxes(pulls, 1, 2) @ self._cameras[0].reshape(3 * V, 3)
         w = named @ _BONE_HALVES * depths.right * depths.weight  # (B, 2, V, K)
-        bones = np.swapaxes(w.sum(axis=1), 1, 2) @ along
-        bone_pull = np.swapaxes((w * depths.away[0]).sum(axis=1), 1, 2) @ self._sight
-        information = np.concatenate([information, bones], axis=1).reshape(B, -1, 3, 3)
-        return cost, information, np.concatenate([pull, bone_pull], axis=1)
+        information = [across @ moments.reshape(B, 4 * V, L), along @ w.sum(axis=1)]
+        bone_pull = np.swapaxes(self._sight, -1, -2) @ (w * depths.away[0]).sum(axis=1)
+        pull = [self._cameras[0].reshape(3 * V, 3).T @ pulls, bone_pull]
+        return cost, np.concatenate(information, axis=2).reshape(B, 3, 3, -1), np.concatenate(pull, axis=2)
 
     def _likelihood(self, x: Float) -> tuple[Float, Float, _Match, _Match, Float]:
         """Return the negative logarithm (B,) of :meth:`_information`; the points (B, V, 3, L) in the cameras' frames,
         with a depth of 1 behind a camera; what landmarks and depths are compared with; and the probability
         (B, 2, V, halves) that an image shows the person with each half as named, and exchanged."""
-        (B, L, _), V = x.shape, len(self._rig)
+        (B, _, L), V = x.shape, len(self._rig)
         rotation, translation = self._cameras
-        q = (rotation.reshape(3 * V, 3) @ np.swapaxes(x, 1, 2)).reshape(B, V, 3, L) + translation[:, :, None]
+        q = (rotation.reshape(3 * V, 3) @ x).reshape(B, V, 3, L) + translation[:, :, None]
         behind = q[:, :, 2] <= 0.1
         q[:, :, 2][behind] = 1.0
-        marks, depths = self._match(q, behind), self._match_depth(_with_bones(x)[:, L:])
+        marks, depths = self._match(q, behind), self._match_depth(_with_bones(x)[..., L:])
         halves = np.stack(
             [
                 np.prod(marks.ratio[..., points], axis=-1) * np.prod(depths.ratio[..., bones], axis=-1)
@@ -288,7 +301,7 @@ class LandmarkCue:
             axis=-1,
         )  # (B, 2, V, halves)
         halves *= np.array([1.0 - EXCHANGED, EXCHANGED])[:, None, None]
-        total = halves.sum(axis=1)
+        total = halves[:, 0] + halves[:, 1]
         image = np.log(total).sum(axis=-1) + np.log(1.0 - ELSEWHERE)  # (B, V)
         image_total = np.logaddexp(image, self._elsewhere)
         named = halves / total[:, None] * np.exp(image - image_total)[:, None, :, None]
@@ -298,7 +311,7 @@ class LandmarkCue:
         """Compare the landmarks with points (B, V, 3, L) in the cameras' frames, of which some are ``behind``
         (B, V, L)."""
         x, y, right, weight = self._marks
-        right = np.where(behind[:, None], 0.0, right)
+        right, weight = np.where(behind[:, None], 0.0, right), self._precision * weight
         q_x, q_y, depth = (q[:, None, :, axis] for axis in range(3))
         away = x * depth - q_x, y * depth - q_y
         inside = right * weight / (2 * np.pi) * np.exp(-0.5 * weight * (away[0] ** 2 + away[1] ** 2))
@@ -306,29 +319,35 @@ class LandmarkCue:
         return _Match(both / WRONG_DENSITY, inside / both, weight, away)
 
     def _match_depth(self, bones: Float) -> _Match:
-        """Compare the depths with bones (B, K, 3), as :func:`_with_bones` has them."""
+        """Compare the depths with bones (B, 3, K), as :func:`_with_bones` has them."""
         seen, right, weight = self._depths
-        away = seen - (self._sight @ np.swapaxes(bones, 1, 2))[:, None]
+        weight = self._precision * weight
+        away = seen - (self._sight @ bones)[:, None]
         inside = right * np.sqrt(weight / (2 * np.pi)) * np.exp(-0.5 * weight * away**2)
         both = inside + (1.0 - right) * WRONG_DENSITY
         return _Match(both / WRONG_DENSITY, inside / both, weight, (away,))
 
 
-def _inverse(matrix: Float) -> tuple[Float, Float]:
-    """Return the inverse (..., 3, 3) and the determinant (...) of symmetric matrices (..., 3, 3)."""
-    a, b, c, d, e, f = (matrix[..., i, k] for i in range(3) for k in range(i, 3))
+def _product(matrix: Float, values: Float) -> Float:
+    """Return the products (..., 3, N) of N matrices (..., 3, 3, N) with vectors (..., 3, N)."""
+    first, second, third = (matrix[..., k, :] * values[..., None, k, :] for k in range(3))
+    return first + second + third
+
+
+def _inverse_with(information: Float, variance: Float) -> tuple[Float, Float]:
+    """Return the inverse (B, 3, 3, N) and the determinant (B, N) of 1 + information · variance, of symmetric matrices
+    (B, 3, 3, N) and numbers (N,) or (B, N)."""
+    a, b, c, d, e, f = (variance * information[:, i, k] + (i == k) for i in range(3) for k in range(i, 3))
     rows = d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b
     determinant = a * rows[0] + b * rows[1] + c * rows[2]
-    order = [0, 1, 2, 1, 3, 4, 2, 4, 5]
-    inverse = np.stack([rows[k] for k in order], axis=-1) / determinant[..., None]
-    return inverse.reshape(matrix.shape), determinant
+    inverse = np.stack([rows[k] for k in (0, 1, 2, 1, 3, 4, 2, 4, 5)], axis=1) / determinant[:, None]
+    return inverse.reshape(information.shape), determinant
 
 
 def _with_bones(values: Float) -> Float:
-    """Return values (B, L, ...) of the landmarks, and those of the bones: the part of the difference between their ends
-    that a network's depth keeps."""
-    share = _SHARE.reshape(-1, *np.ones(values.ndim - 2, int))
-    return np.concatenate([values, share * (values[:, _TO] - values[:, _FROM])], axis=1)
+    """Return values (..., L) of the landmarks, and those of the bones, (..., L + K): the part of the difference between
+    their ends that a network's depth keeps."""
+    return np.concatenate([values, _SHARE * (values[..., _TO] - values[..., _FROM])], axis=-1)
 
 
 def known_landmarks(seen: Float) -> NDArray[np.bool_]:
@@ -385,9 +404,9 @@ def propose(rig: Rig, body: ConeBody, seen: Float, p_near: Float) -> Float:
     skeleton = body.skeleton
     start = figures(skeleton, p_near)
     prior = Quadratic.about(start, np.where(skeleton.prismatic, 1.0, np.pi) ** -2.0)
-    poses = start
-    for widened in WIDENED:
-        cue = LandmarkCue(rig, body, seen, widened)
+    poses, cue = start, LandmarkCue(rig, body, seen)
+    for factor in WIDENED:
+        cue = cue.widened(factor)
         for _ in range(2):
             cost = cue.normal(poses) + prior
             step = np.linalg.solve(cost.matrix, cost.linear[..., None])[..., 0] - poses

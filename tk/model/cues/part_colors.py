@@ -141,15 +141,15 @@ def color_bins(images: NDArray[np.uint8]) -> NDArray[np.int32]:
 
 def _smooth(counts: Float) -> NDArray[np.float32]:
     """Return histograms (N, COLOR_BINS), each smoothed over neighbouring bins."""
-    cubes = counts.reshape(-1, 16, 16, 16).astype(np.float32)
-    for _ in range(3):  # along the last axis, which then becomes the first of the three
-        cubes = np.moveaxis(cubes @ _smoothing(), 3, 1)
+    cubes = counts.astype(np.float32)
+    for _ in range(3):  # along the last axis of each cube, which then becomes the first of the three
+        cubes = _smoothing() @ cubes.reshape(-1, 256, 16).swapaxes(1, 2)
     return cubes.reshape(counts.shape)
 
 
 @functools.cache
 def _smoothing() -> NDArray[np.float32]:
-    """Return the matrix (16, 16) that smooths a histogram of 16 bins, a row, from the right."""
+    """Return the matrix (16, 16) that smooths a histogram of 16 bins, a column."""
     across = 2 * int(4 * _SMOOTHING + 0.5) + 1
     weights = cv2.GaussianBlur(np.eye(16), (1, across), _SMOOTHING, borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(weights.T, np.float32)
+    return np.asarray(weights, np.float32)

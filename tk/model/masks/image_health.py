@@ -110,7 +110,7 @@ class ImageHealth(Stateful[HealthState]):
         small = _thinned(masks, masks) >= PERSON
         given = images.size > 0
         # the green channel suffices
-        shown = _thinned(images[..., 1], masks).copy() if given else small * np.uint8(255)
+        shown = _thinned(images, masks)[..., 1].copy() if given else small * np.uint8(255)
         self.moved = moved = self._shift.look(images, masks, doubtful) if given else np.full(C, np.nan)
         look = _Look(shown, small, moved, given)
         faulty = {name: measure(self, look) for name, (_, measure) in IMAGE_FAULTS.items()}

@@ -184,19 +184,22 @@ def _register(first: Gray, now: Gray, still: NDArray[np.bool_], shift: Float) ->
         shift: (2,) where to begin.
     """
     h, w = first.shape
-    y, x = np.nonzero(still)
+    within = np.zeros(still.shape, np.bool_)
+    border = int(_COARSE)
+    within[border : h - border, border : w - border] = still[border : h - border, border : w - border]
+    y, x = np.nonzero(within)
     gradient = np.stack([cv2.Sobel(first, cv2.CV_32F, dx, 1 - dx, scale=1 / 8)[y, x] for dx in (1, 0)], axis=-1)
-    before = np.stack([x, y], axis=-1).astype(np.float64)
-    border = np.array([_COARSE, _COARSE])
+    before = first[y, x]
 
     def seen_by_both(shift: Float) -> NDArray[np.bool_]:
-        at = np.stack([before, before + shift])
-        return np.asarray(np.all((at >= border) & (at <= (w - 1, h - 1) - border), axis=(0, 2)))
+        at_x, at_y = x + shift[0], y + shift[1]
+        inside = (at_x >= border) & (at_x <= w - 1 - border) & (at_y >= border) & (at_y <= h - 1 - border)
+        return np.asarray(inside)
 
     def values(seen: NDArray[np.bool_], shift: Float) -> tuple[Gray, Gray]:
         """Return the pixels' values in the first image and in this one."""
-        at_x, at_y = (before[seen] + shift).T.astype(np.float32)
-        return first[y[seen], x[seen]], np.asarray(cv2.remap(now, at_x, at_y, cv2.INTER_LINEAR), np.float32).ravel()
+        at_x, at_y = (x[seen] + shift[0]).astype(np.float32), (y[seen] + shift[1]).astype(np.float32)
+        return before[seen], np.asarray(cv2.remap(now, at_x, at_y, cv2.INTER_LINEAR), np.float32).ravel()
 
     correlation, gain = 0.0, np.nan
     for _ in range(_ITERATIONS):
