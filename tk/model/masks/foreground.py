@@ -22,7 +22,9 @@ No state passes from one frame to the next, so a resumed run gives the same mask
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -47,6 +49,7 @@ from tk.model.masks.mosaic import Mosaic, doubled
 from tk.model.masks.person_boxes import PersonBoxes
 from tk.model.masks.regions import clean_by_area, closed, enclosed, person_parts, trim_rim, without_penumbrae
 from tk.settings import ForegroundSettings
+from tk.system.machine import cores
 
 # The constants below were chosen on rendered captures with exact masks and on one real capture.
 
@@ -226,11 +229,16 @@ class CollinearityForeground:
         plates = np.zeros((len(clips), *frame_shape, 3), np.uint8)
         relative = np.ones((len(clips), *(n // _REDUCTION for n in frame_shape)), np.float32)
         floor = np.array([_STILL_NOISE if len(clip) == 1 else _NOISE_FLOOR for clip in clips])
-        for c, (clip, (width, height)) in enumerate(zip(clips, sizes, strict=True)):
+
+        def take(c: int) -> None:
+            clip, (width, height) = clips[c], sizes[c]
             plates[c, :height, :width] = np.clip(mean_scene(clip).round(), 0, 255)
             small_plate, variance = learn_scene(reduced(clip, _REDUCTION))
             noise = relative_noise(small_plate, variance, _NOISE_FLOOR)
             relative[c, : noise.shape[0], : noise.shape[1]] = noise
+
+        with ThreadPoolExecutor(min(cores(), len(clips))) as threads:
+            deque(threads.map(take, range(len(clips))), maxlen=0)
         return cls(plates, relative, sizes, config, floor)
 
     @classmethod
