@@ -19,7 +19,7 @@ from tk.model.setup import Subject
 from tk.optim.gauss_newton import BatchSolution
 from tk.settings import SilhouetteSettings
 from tk.trackers.hypotheses import DROPPED, TrajectoryHypothesis, walking
-from tk.trackers.initialisation import find_person, stature_of
+from tk.trackers.initialisation import find_in, find_person, stature_of
 from tk.trackers.protocol import Frame
 from tk.trackers.silhouette import SilhouetteTracker
 
@@ -282,3 +282,27 @@ def test_start_with_landmarks_begins_with_their_pose(monkeypatch) -> None:
     monkeypatch.setattr("tk.trackers.proposals.anywhere.gait.figures", lambda *_: np.array([far]))
     found = find_person(tracker, [tracker.see(frame)])[0].poses
     assert error(tracker.world.points_out(SKELETON.joints(found)), pose[None])[0] < 0.04
+
+
+def test_a_search_in_the_first_frame_serves_the_opening_that_begins_with_it(monkeypatch) -> None:
+    """Whether the search began before the other frames were there, the result is the same; for another opening, or for
+    another subject, it begins again."""
+    poses = np.array([placed(walking_pose(SKELETON, phase), 0.4) for phase in np.linspace(0.0, 0.3, 4)])
+    masks = draw_silhouettes(BODY, RIG, poses)
+    frames = [Frame(i, np.zeros(0, np.uint8), m) for i, m in enumerate(masks)]
+    searched = []
+    monkeypatch.setattr(
+        "tk.trackers.contour_finder.find_in", lambda *args: searched.append(args[1].frame.index) or find_in(*args)
+    )
+
+    def found_after(anticipated: Frame, subject: Subject) -> np.ndarray:
+        tracker = tracker_of()
+        tracker.anticipate(anticipated, subject)
+        return tracker.find(frames, Subject(STATURE))
+
+    expected = tracker_of().find(frames, Subject(STATURE))
+    assert searched == [0]
+    for anticipated, subject, again in ((0, STATURE, []), (1, STATURE, [0]), (0, 1.6, [0])):
+        searched.clear()
+        np.testing.assert_array_equal(found_after(frames[anticipated], Subject(subject)), expected)
+        assert searched == [anticipated, *again]

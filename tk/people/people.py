@@ -138,6 +138,14 @@ class People:
             self._located = frame, self._finder.find(frame.masks, frame.uncertain)
         return self._located[1]
 
+    def anticipate(self, frame: Frame) -> None:
+        """Locate the people in the first frame of an opening, and search for the pose of one who is alone, before the
+        other frames are there."""
+        found, one = self.locate(frame), self._choice in ("auto", "all", (0,))
+        if one and len(found) == 1 and not self._finder.is_empty(frame.masks, found):
+            subject = matched(self._setup.subjects[:1], found, self._setup.up)[0]
+            self._first.anticipate(frame, replace(subject, hull_m=found[0].height_m))
+
     def start(self, opening: Sequence[Frame], given_masks: bool = False) -> bool:
         """Find the people in the first frame, and start a tracker for everybody in the volume.
 

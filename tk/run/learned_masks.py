@@ -23,7 +23,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from tk.io.captures.capture import Capture
 from tk.io.captures.frames import FrameSet
-from tk.model.masks.foreground import CollinearityForeground
+from tk.model.masks.foreground import CollinearityForeground, Prior
 from tk.model.masks.learned_scene import LearnedScene
 from tk.run.task import Task
 
@@ -60,7 +60,7 @@ _SAMPLE_BYTES = 512_000_000
 _DISAGREE = 0.65
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Sample:
     """What the segmenter sees in a frame.
 
@@ -256,7 +256,7 @@ def _checked(foreground: CollinearityForeground | None, images: dict[int, Masks]
         shown = images.pop(index)
         if foreground is None:
             return np.zeros(len(seen.masks), np.bool_)
-        found = foreground.label(shown, prior=(seen.masks, seen.uncertain))[0]
+        found = foreground.label(shown, prior=Prior.of(seen.masks, seen.uncertain))[0]
         one, either = (np.count_nonzero(pixels, axis=(1, 2)) for pixels in (found ^ seen.masks, found | seen.masks))
         return np.asarray(one <= _DISAGREE * either)
 
@@ -271,10 +271,11 @@ def _edges(first: int, count: int | None, fps: float) -> list[int]:
     return [first + (count - first) * k // spans for k in range(spans + 1)]
 
 
-def _between(before: _Sample, after: _Sample) -> tuple[Masks, Bool]:
-    """Return what two samples say of the pixels between them: those of the person, and those that may be."""
-    if before is after:
-        return before.seen.masks, before.seen.uncertain
+@lru_cache(1)  # the frames between two samples ask one after the other
+def _between(before: _Sample, after: _Sample) -> Prior:
+    """Return what two samples say of the pixels between them."""
     one, other = before.seen, after.seen
+    if before is after:
+        return Prior.of(one.masks, one.uncertain)
     person = one.masks & other.masks
-    return person, (one.masks > person) | (other.masks > person) | one.uncertain | other.uncertain
+    return Prior.of(person, (one.masks > person) | (other.masks > person) | one.uncertain | other.uncertain)

@@ -146,7 +146,7 @@ class Loop:
         observations = _fill(opening, observations, 1)
         if opening:
             with one_thread():  # while the others are made
-                self.people.locate(opening[0][0])
+                self.people.anticipate(opening[0][0])
         observations = _fill(opening, observations, count)
         source, stop = self.plan.task.source, self.plan.stop
         while opening and (stop is None or opening[0][0].index < stop):

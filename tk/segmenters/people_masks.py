@@ -40,7 +40,7 @@ from tk.model.body.body_points import LANDMARKS
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.landmark_agreement import Consensus, associated, consensus
 from tk.model.cameras.volume import Volume
-from tk.model.hull.coarse import CoarseHull
+from tk.model.hull.coarse import CoarseHull, parts
 from tk.model.masks.sightings import Patch, SeenPerson, Sighting, locate, volume_patch
 from tk.segmenters import Finder, Segmenter, segmented
 from tk.system.machine import cores
@@ -166,10 +166,14 @@ class PeopleMasks:
 
     def without_specks(self, masks: Images) -> Images:
         """Return masks (C, H, W) without small parts that no other camera shows: shadows, reflections."""
-        if all(cv2.connectedComponents(mask)[0] <= 2 for mask in masks):  # the scene and one part
+        areas = [parts(mask)[2] for mask in masks]
+        doubtful = [c for c, area in enumerate(areas) if (area < _SPECK * area.max(initial=0)).any()]
+        if not doubtful:
             return masks
-        hull = self._hull.everybody(masks)
-        return np.stack([self._hull.only(hull, c, mask, _SPECK) for c, mask in enumerate(masks)])
+        hull, result = self._hull.everybody(masks), masks.copy()
+        for c in doubtful:
+            result[c] = self._hull.only(hull, c, masks[c], _SPECK)
+        return result
 
     def _people(self, images: Images, expected: Sequence[SeenPerson], turn: int) -> list[_Person]:
         if not isinstance(self._segmenter, Finder):
@@ -331,10 +335,13 @@ class PeopleMasks:
 
     def _paint(self, image: Images, c: int, mask: Images, patch: Patch) -> None:
         """Paint a mask (H, W) over in an image (H, W, 3), with the mean colour of the other pixels."""
-        width = 2 * max(round(_RIM * patch.side), 1) + 1
-        grown = cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width)))
-        picture, person = self._shown(image, c), self._shown(grown, c) > 0
-        picture[person] = cv2.mean(picture, (~person).view(np.uint8))[:3]
+        picture, shown, radius = self._shown(image, c), self._shown(mask, c), max(round(_RIM * patch.side), 1)
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+        x, y, w, h = cv2.boundingRect(shown)
+        around = slice(max(y - radius, 0), y + h + radius), slice(max(x - radius, 0), x + w + radius)
+        others = np.ones(shown.shape, np.uint8)
+        others[around] = cv2.dilate(shown[around], disc) == 0
+        picture[around][others[around] == 0] = cv2.mean(picture, others)[:3]
 
     def _empty(self, patches: Sequence[Patch]) -> _Person:
         shape = len(self._rig), *self._rig.frame_shape
@@ -374,7 +381,7 @@ class PeopleMasks:
     @staticmethod
     def _put(person: _Person, c: int, found: NDArray[np.float32]) -> None:
         """Replace a person's mask in an image by the probabilities (H, W)."""
-        person.masks[c] = np.where(found > 0.5, 255, 0)
+        np.multiply(found > 0.5, np.uint8(255), out=person.masks[c])
         person.uncertain[c] = (found > _UNCERTAIN) & (found <= 0.5)
 
     def _seen(self, image: Images, c: int, patch: Patch) -> tuple[NDArray[np.float32], NDArray[np.float64]]:

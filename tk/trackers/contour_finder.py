@@ -6,7 +6,7 @@ masks → cleaned, scales → {contours → edgels along their normals → norma
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import zip_longest
@@ -43,7 +43,7 @@ from tk.optim.gauss_newton import BatchSolution, GaussNewtonSettings
 from tk.optim.quadratic import Quadratic
 from tk.settings import SilhouetteSettings
 from tk.trackers.hypotheses import PROPOSED, SAME_POSE_M, TrajectoryHypothesis, turning
-from tk.trackers.initialisation import find_person, stature_of
+from tk.trackers.initialisation import Found, find_in, find_person, stature_of
 from tk.trackers.proposals import exchanged, limbs
 from tk.trackers.proposals.anywhere import centroid
 from tk.trackers.protocol import Frame
@@ -87,6 +87,31 @@ class Seen:
     images: NDArray[np.uint8] | None = None
 
 
+@dataclass(frozen=True)
+class _Begun:
+    """A search in the first frame of an opening.
+
+    Attributes:
+        masks: of the frame.
+        subject: what was known of the person.
+        average: the average body.
+        rough: (D,) the known rough pose on this body, if any.
+        found: what the frame shows.
+    """
+
+    masks: NDArray[np.uint8]
+    subject: Subject
+    average: BodyDimensions
+    rough: Float | None
+    found: Found
+
+    def serves(self, frame: Frame, subject: Subject) -> bool:
+        """Return whether the same search in a frame would find the same."""
+        own = self.subject
+        same = own.init is subject.init and own.body is subject.body
+        return same and self.masks is frame.masks and (own.height_m, own.hull_m) == (subject.height_m, subject.hull_m)
+
+
 class ContourFinder:
     """Finds the pose of one person's body in a frame. It knows the body, but no earlier frame.
 
@@ -120,6 +145,7 @@ class ContourFinder:
         skeleton = build_skeleton(AVERAGE_BODY)
         self.pose_names, self.pose_units = skeleton.names, skeleton.units
         self._body: ConeBody | None = None
+        self._begun: _Begun | None = None  # what :meth:`anticipate` has found
         self._cues: tuple[tuple[object, ...], list[Cue]] = ((None,), [])  # the last ones, and what they are of
         self.colors: PartColors
         self.limbs: tuple[Limb, ...]
@@ -167,6 +193,12 @@ class ContourFinder:
 
     # --- initialisation (silhouette paper, section 4.6) ---------------------------------------------------------
 
+    def anticipate(self, frame: Frame, subject: Subject) -> None:
+        """Search for the person in a frame before those after it are there; :meth:`find` takes what is found, if it
+        begins with this frame."""
+        with suppress(CaptureError):  # find() raises it
+            self._begun = self._begin(frame, self.pyramid(frame), subject)
+
     def find(self, frames: Sequence[Frame], subject: Subject) -> Float:
         """Return the pose (D,) in the first of the frames; the body is fitted to all of them.
 
@@ -179,10 +211,8 @@ class ContourFinder:
             CaptureError: fewer than two cameras see anybody in the first frame, or the silhouettes contradict the
                 height.
         """
-        pyramids = [self.pyramid(frame) for frame in frames]
-        rough: Float | None = None
-        init, hull_m = subject.init, subject.hull_m
-        stature = (init and init.height_m) or subject.height_m
+        pyramids, init = [self.pyramid(frame) for frame in frames], subject.init
+        stature, expected = (init and init.height_m) or subject.height_m, None
         if init is None:
             centroid(self.views.rig, pyramids[0], frames[0].index)  # raises if nobody is there, before a body is taken
             apparent = stature_of(self, pyramids[:: 6 if stature else 1])  # a check needs fewer frames
@@ -192,21 +222,37 @@ class ContourFinder:
                     f"{apparent:.2f} m: correct the height in capture.toml, or omit it; if it is right, "
                     "calibration.toml has another unit or scale"
                 )
-            # clothes enlarge the silhouettes, raised arms the hull; who bends has a low hull
-            if hull_m and apparent / hull_m < MOST_STATURE_RATIO:
-                apparent = min(apparent, hull_m)
-            average = BodyDimensions.from_stature(stature or apparent)
-        else:
-            average, given, angles = rough_pose(init.joints, init.angles, stature, self.world)
-        self.take_body(subject.body or build_cone_body(average))
-        if init is not None:
-            rough = self.settle(pyramids[0], convert_poses(angles, given, self.body.skeleton)[None]).states[0]
+            expected = BodyDimensions.from_stature(stature or _stature(apparent, subject.hull_m))
+        begun, self._begun = self._begun, None
+        if len(frames) == 1 or begun is None or not begun.serves(frames[0], subject):
+            begun = self._begin(frames[0], pyramids[0], subject, len(frames) == 1)
         with self._opening_cameras(frames, pyramids) as (some, silhouettes):
             seen = [self.see(blind(f), pyramid=shown) for f, shown in zip(some, silhouettes, strict=True)]
-            hypotheses = find_person(self, seen, rough)
+            hypotheses = find_person(self, seen, begun.rough, begun.found)
         if not self.contours.adapt or subject.body is not None:
             return np.asarray(hypotheses[0].poses[0])
-        return self._adapt(frames, pyramids, hypotheses, average.barefoot, stature is not None)
+        barefoot = (expected or begun.average).barefoot
+        return self._adapt(frames, pyramids, hypotheses, barefoot, stature is not None)
+
+    def _begin(self, frame: Frame, pyramid: Pyramid, subject: Subject, alone: bool = False) -> _Begun:
+        """Take an average body, or the one that is known, and search for the person in the first frame of an opening.
+
+        The body's size is that of this frame, because the others may not be there yet. ``alone``: there are none.
+        """
+        init, rough = subject.init, None
+        if init is None:
+            centroid(self.views.rig, pyramid, frame.index)  # raises if nobody is there
+            stature = subject.height_m or _stature(stature_of(self, [pyramid]), subject.hull_m)
+            average = BodyDimensions.from_stature(stature)
+        else:
+            height_m = init.height_m or subject.height_m
+            average, given, angles = rough_pose(init.joints, init.angles, height_m, self.world)
+        self.take_body(subject.body or build_cone_body(average))
+        if init is not None:
+            rough = self.settle(pyramid, convert_poses(angles, given, self.body.skeleton)[None]).states[0]
+        with self._opening_cameras([frame], [pyramid]) as (some, silhouettes):
+            found = find_in(self, self.see(blind(some[0]), pyramid=silhouettes[0]), rough, alone)
+        return _Begun(frame.masks, subject, average, rough, found)
 
     @contextmanager
     def _opening_cameras(
@@ -243,7 +289,8 @@ class ContourFinder:
         """Fit the body to the opening and return the pose (D,) in its first frame.
 
         Of several hypotheses the one is chosen that has the lowest sum of two costs: that with the average body and
-        that with the body fitted to it, because a fitted body compensates a part of a wrong trajectory.
+        that with the body fitted to it, in the frames of the fit, because a fitted body compensates a part of a wrong
+        trajectory.
 
         Args:
             frames, pyramids: the F frames of the opening, and their silhouettes.
@@ -259,7 +306,7 @@ class ContourFinder:
             cost = hypothesis.cost
             if len(hypotheses) > 1:
                 self.take_body(body)
-                costs = np.array(list(map(self._converged_cost, frames, pyramids, hypothesis.poses)))
+                costs = np.array([self._converged_cost(frames[i], pyramids[i], hypothesis.poses[i]) for i in chosen])
                 cost += float(costs[np.isfinite(costs)].mean())  # infinite in frames without a person
             found.append((cost, body, fitted[0]))
         _, body, pose = min(found, key=lambda one: one[0])
@@ -419,6 +466,12 @@ class ContourFinder:
 def blind(frame: Frame) -> Frame:
     """Return the frame without images, for what does not use colours."""
     return replace(frame, images=frame.images[:0])
+
+
+def _stature(apparent: float, hull_m: float | None) -> float:
+    """Return the stature by what the silhouettes' area suggests and the height of the visual hull, metres: clothes
+    enlarge the silhouettes, raised arms the hull; who bends has a low hull."""
+    return min(apparent, hull_m) if hull_m and apparent / hull_m < MOST_STATURE_RATIO else apparent
 
 
 def _only(frame: Frame, views: NDArray[np.intp]) -> Frame:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import groupby
 from operator import itemgetter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +48,9 @@ FOLLOWED = 8
 TRUNK = [JOINTS.index(name) for name in ("pelvis", "neck", *SHOULDERS, *HIPS)]
 
 
-def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None = None) -> list[TrajectoryHypothesis]:
+def find_person(
+    finder: ContourFinder, seen: Sequence[Seen], pose: Float | None = None, begun: Found | None = None
+) -> list[TrajectoryHypothesis]:
     """Return trajectory hypotheses over F consecutive frames, best first. Those after the first are nearly as probable;
     the caller fits a body to each of them to decide.
 
@@ -56,12 +58,15 @@ def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None 
         finder: with an average body.
         seen: what F frames show, at least one, without images.
         pose: (D,) pose in the first frame, if known; there is one hypothesis then.
+        begun: what :func:`find_in` has found in the first frame, if it was called before.
 
     Raises:
         CaptureError: fewer than two cameras see anybody in the first frame, or no pose explains what they see.
     """
+    alone = len(seen) == 1
+    begun = begun or find_in(finder, seen[0], pose, alone)
     if pose is not None:
-        return _follow(finder, seen, finder.improved(seen[0], pose)[None], 0)
+        return _follow(finder, seen, begun.poses, 0)
     skeleton = finder.body.skeleton
     hypotheses: list[TrajectoryHypothesis] = []
     alternatives: list[tuple[int, int, Float]] = []  # rank in its anchor, anchor, pose
@@ -69,10 +74,8 @@ def find_person(finder: ContourFinder, seen: Sequence[Seen], pose: Float | None 
     least = np.inf
     for anchor in np.unique(np.linspace(0, len(seen) - 1, ANCHORS).astype(int)):
         try:
-            residual, poses = _find(finder, seen[anchor], alone=len(seen) == 1)
+            residual, poses = begun if anchor == 0 else find_in(finder, seen[anchor], None, alone)
         except CaptureError:
-            if anchor == 0:
-                raise
             continue
         least = min(least, residual)
         if residual > finder.contours.lost_error:
@@ -111,9 +114,26 @@ def _contains(skeleton: Skeleton, hypotheses: Sequence[TrajectoryHypothesis], fr
     return any(skeleton.apart(hypothesis.poses[frame], joints) < DISTINCT_M for hypothesis in hypotheses)
 
 
-def _find(finder: ContourFinder, seen: Seen, alone: bool) -> tuple[float, Float]:
-    """Return the residual (E_S) of the best pose in a frame, and poses (B, D): the best one, then those that are not
-    improbable beside it; ``alone``: no other frame follows, which would correct the limbs."""
+class Found(NamedTuple):
+    """The residual (E_S) of the best pose in a frame, and poses (B, D): the best one, then those that are not
+    improbable beside it."""
+
+    residual: float
+    poses: Float
+
+
+def find_in(finder: ContourFinder, seen: Seen, pose: Float | None, alone: bool) -> Found:
+    """Return what is found in one frame.
+
+    Args:
+        finder, seen, pose: as for :func:`find_person`.
+        alone: no other frame follows, which would correct the limbs.
+
+    Raises:
+        CaptureError: fewer than two cameras see anybody.
+    """
+    if pose is not None:
+        return Found(0.0, finder.improved(seen, pose)[None])
     skeleton = finder.body.skeleton
     found = np.concatenate([anywhere.propose(finder, seen), landmarks.propose(finder, seen)])
     both = [opposite.propose(finder, seen, pose, range(finder.solver.scales)[::-1]) for pose in found[:OPPOSITE]]
@@ -130,7 +150,7 @@ def _find(finder: ContourFinder, seen: Seen, alone: bool) -> tuple[float, Float]
     order = np.argsort(cost, kind="stable")
     kept = poses[order[cost[order] < cost.min() + DROPPED]]
     kept = kept[different(skeleton, kept, DISTINCT_M)]
-    return float(finder.mean_residual(seen.pyramid, kept[:1], seen.frame.uncertain)[0]), kept
+    return Found(float(finder.mean_residual(seen.pyramid, kept[:1], seen.frame.uncertain)[0]), kept)
 
 
 def _follow(

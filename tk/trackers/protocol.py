@@ -186,6 +186,11 @@ class Tracker(Protocol):
         """Compile kernels while there is nothing else to do."""
         ...
 
+    def anticipate(self, frame: Frame, subject: Subject) -> None:
+        """Search for the subject in a frame before those after it are there. If :meth:`start` begins with this frame,
+        it takes what is found."""
+        ...
+
     def start(self, frames: Sequence[Frame], subject: Subject) -> None:
         """Find the subject in the first of ``frames`` and fit the body. The first :meth:`step` is for that frame, too.
 

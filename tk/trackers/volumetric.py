@@ -131,15 +131,17 @@ class VolumetricTracker(Stateful[VolumetricState]):
         """Compile the kernels of the initialisation ahead of its first frame."""
         self._finder.prepare()
 
+    def anticipate(self, frame: Frame, subject: Subject) -> None:
+        """See :class:`~tk.trackers.protocol.Tracker`."""
+        self._finder.anticipate(_blind(frame), subject)
+
     def start(self, frames: Sequence[Frame], subject: Subject) -> None:
         """Find the subject in the first frame and fit the body to all frames, see :meth:`ContourFinder.find`.
 
         Raises:
             CaptureError: the volume is empty.
         """
-        # without images: colours inside the silhouettes are a cue of the region tracker only
-        blind = [Frame(f.index, f.images[:0], f.masks) for f in frames]
-        pose = self._finder.find(blind, subject)
+        pose = self._finder.find([_blind(frame) for frame in frames], subject)
         first = frames[0]
         self.hull.update(first.masks)
         surface = self.hull.surface(first.images)
@@ -325,3 +327,8 @@ class VolumetricTracker(Stateful[VolumetricState]):
         """Take the body of a run."""
         self._finder.take_body(restore_body(model))
         self._build()
+
+
+def _blind(frame: Frame) -> Frame:
+    """Return a frame without images: colours inside the silhouettes are a cue of the region tracker only."""
+    return Frame(frame.index, frame.images[:0], frame.masks)

@@ -27,6 +27,8 @@ _VOXELS = 48
 LEAST_LITRES = 10.0
 # A region of a mask belongs to the person within this many voxels of the hull: thin limbs contain no voxel's centre.
 _NEAR_VOXELS = 2.5
+# What the distance transform takes for the distance of two neighbouring pixels, at least.
+_CHAMFER = 0.95
 # With this many cameras that see a voxel, one of them may be wrong, if the hull would otherwise shrink to this share.
 _ENOUGH, _MUCH_SMALLER = 4, 0.4
 # Half the diagonal of a voxel, in edges.
@@ -157,33 +159,36 @@ class CoarseHull:
 
         One of four or more cameras may be wrong, if the hull would be much smaller otherwise.
         """
-        strict, lenient = (self._agreed(masks, cameras, wrong) for wrong in (0, 1))
+        counts = self._counts(masks, cameras)
+        strict, lenient = (self._largest(*counts, wrong) for wrong in (0, 1))
         return strict if np.count_nonzero(strict) >= _MUCH_SMALLER * np.count_nonzero(lenient) else lenient
 
     def everybody(self, masks: NDArray[np.uint8]) -> Bool:
         """Return (N,) the voxels in all masks (C, H, W), or in all but one of four or more."""
-        return self._in_most(masks, np.ones(len(masks), np.bool_), 1)[0]
+        return _in_most(*self._counts(masks, np.ones(len(masks), np.bool_)), 1)
 
-    def _in_most(self, masks: NDArray[np.uint8], cameras: Bool, wrong: int) -> tuple[Bool, NDArray[np.int64]]:
-        """Return (N,) the voxels that all but ``wrong`` masks contain, and in how many masks each voxel is."""
-        sees = self._voxels.sees & cameras[:, None]
-        seeing = sees.sum(axis=0)
-        agreeing = (self._voxels.inside(masks) & sees).sum(axis=0)
-        return (seeing >= 2) & (agreeing >= np.where(seeing >= _ENOUGH, seeing - wrong, seeing)), agreeing
+    def _counts(self, masks: NDArray[np.uint8], cameras: Bool) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Return (N,) how many of some cameras (C,) see each voxel, and in how many of their masks (C, H, W) it is."""
+        seeing, agreeing = np.zeros((2, len(self._voxels.centers)), np.uint8)
+        for c in np.flatnonzero(cameras):
+            sees = self._voxels.sees[c]
+            seeing += sees
+            agreeing += sees & (masks[c].ravel()[self._voxels.pixels[c]] > 0)
+        return seeing, agreeing
 
-    def _agreed(self, masks: NDArray[np.uint8], cameras: Bool, wrong: int) -> Bool:
-        hull, agreeing = self._in_most(masks, cameras, wrong)
-        label = regions(hull.reshape(self._grid.shape)).reshape(-1)
-        count = int(label.max())
-        if count == 0:
+    def _largest(self, seeing: NDArray[np.uint8], agreeing: NDArray[np.uint8], wrong: int) -> Bool:
+        hull = _in_most(seeing, agreeing, wrong)
+        chosen = np.flatnonzero(hull)
+        if not len(chosen):
             return hull
+        label, agree = regions(hull.reshape(self._grid.shape)).reshape(-1)[chosen], agreeing[chosen]
         # a region that only two cameras see may be larger than the person, whom more of them see
-        sizes = np.array(
-            [np.bincount(label[hull & (agreeing >= n)], minlength=count + 1) for n in range(2, len(masks) + 1)]
-        )
+        levels = range(2, len(self._voxels.sees) + 1)
+        sizes = np.array([np.bincount(label[agree >= n], minlength=int(label.max()) + 1) for n in levels])
         large = sizes * self._litre >= LEAST_LITRES
         level = int(np.flatnonzero(large.any(axis=1))[-1]) if large.any() else 0
-        return np.asarray(label == sizes[level].argmax(), np.bool_) & hull
+        hull[chosen] = label == sizes[level].argmax()
+        return hull
 
     def litres(self, voxels: Bool) -> float:
         """Return the volume of voxels (N,)."""
@@ -201,23 +206,59 @@ class CoarseHull:
     def only(self, voxels: Bool, c: int, mask: NDArray[np.uint8], large: float = np.inf) -> NDArray[np.uint8]:
         """Return the regions of a mask (h, w) that are near voxels (N,) or have the share ``large`` of the largest
         region's area; the whole mask if the image shows none of the voxels."""
-        count, regions, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
-        if count <= 1:
+        box, labels, area = parts(mask)
+        kept = np.append(True, area >= large * area.max(initial=1))  # the background, and the regions
+        if kept.all():
             return mask
-        area = stats[:, cv2.CC_STAT_AREA]
-        kept = area >= large * area[1:].max()
-        kept[regions[self.near(voxels, c, mask.shape)]] = True
-        return mask if kept[1:].all() else np.where(kept[regions], mask, 0).astype(np.uint8)
+        # what is near the other regions, and the pixels over which distances to these are measured
+        margin = int(np.ceil(self._near_px(c) / _CHAMFER)) + 1
+        x, y, w, h = cv2.boundingRect((~kept)[labels].view(np.uint8))
+        x, y = x + box[1].start, y + box[0].start
+        around = slice(max(y - margin, 0), y + h + margin), slice(max(x - margin, 0), x + w + margin)
+        seen = self._voxels.xy(c, voxels)
+        if not len(seen):
+            return mask
+        near = np.zeros(mask.shape, np.bool_)
+        near[around] = self._near(c, seen - (around[1].start, around[0].start), mask[around].shape)
+        kept[labels[near[box]]] = True
+        if kept.all():
+            return mask
+        result = np.zeros_like(mask)
+        result[box] = np.where(kept[labels], mask[box], 0)
+        return result
 
     def near(self, voxels: Bool, c: int, shape: tuple[int, ...]) -> Bool:
         """Return (h, w) the pixels near voxels (N,) in a camera's image; all of them if the image shows none."""
-        x, y = self._voxels.xy(c, voxels).T
+        seen = self._voxels.xy(c, voxels)
+        return self._near(c, seen, shape) if len(seen) else np.ones(shape, np.bool_)
+
+    def _near(self, c: int, pixels: NDArray[np.int64], shape: tuple[int, ...]) -> Bool:
+        """Return (h, w) what is near pixels (M, 2) in a part of this shape of a camera's image."""
         away = np.ones(shape, np.uint8)
+        x, y = pixels[((pixels >= 0) & (pixels < shape[::-1])).all(axis=1)].T
         away[y, x] = 0
         if away.all():
-            return away > 0
-        distance = cv2.distanceTransform(away, cv2.DIST_L2, 3)
-        return np.asarray(distance <= _NEAR_VOXELS * self._voxels.pixels_per_voxel[c])
+            return np.zeros(shape, np.bool_)
+        return np.asarray(cv2.distanceTransform(away, cv2.DIST_L2, 3) <= self._near_px(c))
+
+    def _near_px(self, c: int) -> float:
+        return float(_NEAR_VOXELS * self._voxels.pixels_per_voxel[c])
+
+
+def parts(mask: NDArray[np.uint8]) -> tuple[tuple[slice, slice], NDArray[np.int32], NDArray[np.int32]]:
+    """Return the box that holds a mask (h, w), the number of the 8-connected region of each pixel in it, from 1, 0
+    outside the mask, and (R,) the areas of the regions."""
+    x, y, w, h = cv2.boundingRect(mask)
+    box = slice(y, y + h), slice(x, x + w)
+    if not w:
+        return box, np.zeros((0, 0), np.int32), np.zeros(0, np.int32)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask[box], connectivity=8)
+    return box, np.asarray(labels, np.int32), np.asarray(stats[1:, cv2.CC_STAT_AREA], np.int32)
+
+
+def _in_most(seeing: NDArray[np.uint8], agreeing: NDArray[np.uint8], wrong: int) -> Bool:
+    """Return (N,) the voxels that two cameras or more see, and that all but ``wrong`` masks contain."""
+    return (seeing >= 2) & (agreeing >= np.where(seeing >= _ENOUGH, seeing - np.uint8(wrong), seeing))
 
 
 def regions(voxels: Bool) -> NDArray[np.int32]:

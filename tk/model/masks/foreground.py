@@ -22,7 +22,9 @@ No state passes from one frame to the next, so a resumed run gives the same mask
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -47,6 +49,7 @@ from tk.model.masks.mosaic import Mosaic, doubled
 from tk.model.masks.person_boxes import PersonBoxes
 from tk.model.masks.regions import clean_by_area, closed, enclosed, person_parts, trim_rim, without_penumbrae
 from tk.settings import ForegroundSettings
+from tk.system.machine import cores
 
 # The constants below were chosen on rendered captures with exact masks and on one real capture.
 
@@ -116,6 +119,23 @@ class Foreground(Protocol):
             or cloth of the floor's colour. One camera cannot decide that, several together can.
         """
         ...
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known beforehand of the pixels of reduced images, for those whose scene is unknown.
+
+    Attributes:
+        person, possible: (C, h, w) 0 or 1, whether a pixel contains pixels of the person, and such that may be.
+    """
+
+    person: Images
+    possible: Images
+
+    @classmethod
+    def of(cls, masks: Images, uncertain: NDArray[np.bool_]) -> Prior:
+        """Reduce masks and uncertain pixels (C, H, W)."""
+        return cls(_any(masks), _any(uncertain))
 
 
 @dataclass(frozen=True)
@@ -209,11 +229,16 @@ class CollinearityForeground:
         plates = np.zeros((len(clips), *frame_shape, 3), np.uint8)
         relative = np.ones((len(clips), *(n // _REDUCTION for n in frame_shape)), np.float32)
         floor = np.array([_STILL_NOISE if len(clip) == 1 else _NOISE_FLOOR for clip in clips])
-        for c, (clip, (width, height)) in enumerate(zip(clips, sizes, strict=True)):
+
+        def take(c: int) -> None:
+            clip, (width, height) = clips[c], sizes[c]
             plates[c, :height, :width] = np.clip(mean_scene(clip).round(), 0, 255)
             small_plate, variance = learn_scene(reduced(clip, _REDUCTION))
             noise = relative_noise(small_plate, variance, _NOISE_FLOOR)
             relative[c, : noise.shape[0], : noise.shape[1]] = noise
+
+        with ThreadPoolExecutor(min(cores(), len(clips))) as threads:
+            deque(threads.map(take, range(len(clips))), maxlen=0)
         return cls(plates, relative, sizes, config, floor)
 
     @classmethod
@@ -230,14 +255,14 @@ class CollinearityForeground:
         self,
         images: Images,
         halved: Images | None = None,
-        prior: tuple[Images, NDArray[np.bool_]] | None = None,
+        prior: Prior | None = None,
     ) -> tuple[Images, NDArray[np.bool_]]:
         """Segment images; see :meth:`Foreground.label`. Pixels are uncertain only inside the person's box.
 
         Args:
             images: (C, H, W, 3).
             halved: the same reduced by two, if they are there.
-            prior: masks (C, H, W) and uncertain pixels (C, H, W), taken over where a learned scene is unknown.
+            prior: taken over where a learned scene is unknown.
         """
         masks = np.zeros(images.shape[:3], np.uint8)
         uncertain = np.zeros(images.shape[:3], np.bool_)
@@ -262,7 +287,7 @@ class CollinearityForeground:
                 lit = self._small_scenes[c][near]
                 cv2.transform(scene.plates[c][near], np.diag(gain), dst=lit)
                 if self._small_unknown is not None:  # nothing differs there, in windows that reach there either
-                    np.copyto(lit, self._small[c][near], where=self._small_unknown[c][near].view(np.bool_)[..., None])
+                    cv2.copyTo(self._small[c][near], self._small_unknown[c][near], lit)
         self._statistic.measure(
             1.0 / noise,
             self._bright_sums(scene, gains),
@@ -302,7 +327,7 @@ class CollinearityForeground:
         deviation = 1.4826 * median(np.abs(brighter - middle[:, None]))  # of a normal distribution
         return np.asarray(middle + _BRIGHT_DEVIATIONS * deviation, np.float32)
 
-    def _decide(self, mosaic: Mosaic, prior: tuple[Images, NDArray[np.bool_]] | None) -> tuple[Images, Images]:
+    def _decide(self, mosaic: Mosaic, prior: Prior | None) -> tuple[Images, Images]:
         """Return mosaics of reduced images, 0 or 1: the person, and the uncertain pixels."""
         statistic = self._statistic
         difference, collinearity = statistic.difference, statistic.collinearity
@@ -311,12 +336,12 @@ class CollinearityForeground:
         if not self._learned:
             certain |= statistic.bright.view(np.bool_)
         if self._small_unknown is not None and prior is not None:
-            unknown, shown, either = (
-                _gathered(mosaic, each) for each in (self._small_unknown, _any(prior[0]), _any(prior[1]))
+            unknown, shown, possible = (
+                _gathered(mosaic, each) for each in (self._small_unknown, prior.person, prior.possible)
             )
             np.copyto(certain, shown, where=unknown)
             np.copyto(collinearity, 255, where=unknown & shown)
-            np.copyto(seen, shown | either, where=unknown)
+            np.copyto(seen, shown | possible, where=unknown)
         unsure = seen & ~certain
         foreground = certain | enclosed(unsure, certain, _ENCLOSURE)
         foreground |= unsure & closed(foreground, self._bridge)
