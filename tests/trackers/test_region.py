@@ -457,23 +457,25 @@ def test_sigma_is_large_if_two_poses_have_similar_costs() -> None:
     assert (sigma(np.stack(5 * [half]), hanging) < 0.05).all()
 
 
-def test_modes_of_the_first_pass_add_to_sigma_and_change_no_pose() -> None:
-    """The masks show an arm at both of its places in all frames; the first pass has chosen one, and kept the other."""
-    hanging = np.repeat(POSES[:1], 3, axis=0)
+@pytest.mark.parametrize("frames", [1, 3])
+def test_modes_of_the_first_pass_add_to_sigma_and_change_no_pose(frames: int) -> None:
+    """The masks show an arm at both of its places in all frames; the first pass has chosen one, and kept the other in
+    the one in the middle."""
+    hanging = np.repeat(POSES[:1], frames, axis=0)
     raised = with_arm(POSES[0], "l", (0.1, 1.0, 0.3), 15.0)
     half = draw_silhouettes(BODY, RIG, np.array([POSES[0], raised])).max(axis=0)
     tracker, wrist = tracker_at(POSES[0]), JOINTS.index("wrist_l")
     arm = next(limb for limb in tracker.limbs if "wrist_l" in [JOINTS[k] for k in limb.joints])
     cheap, dear = np.stack([POSES[0], raised]), np.array([2.0, 0.5])
-    modes = np.full((3, limbs.KEPT, len(raised)), np.nan)
-    modes[1] = limbs.others(POSES[0], POSES[0], [limbs.Modes(arm, cheap, dear)])
-    np.testing.assert_array_equal(modes[1, 0, arm.dofs], raised[arm.dofs])
-    assert np.isnan(modes[1, 1]).all(), "the present pose is no other one"
+    modes = np.full((frames, limbs.KEPT, len(raised)), np.nan)
+    modes[frames // 2] = limbs.others(POSES[0], POSES[0], [limbs.Modes(arm, cheap, dear)])
+    np.testing.assert_array_equal(modes[frames // 2, 0, arm.dofs], raised[arm.dofs])
+    assert np.isnan(modes[frames // 2, 1]).all(), "the present pose is no other one"
 
     def solved(modes: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        masks, lost = np.stack(3 * [half]), np.zeros(3, bool)
+        masks, lost = np.stack(frames * [half]), np.zeros(frames, bool)
         poses, _, sigma = tracker.second_pass(
-            masks, hanging, lost, np.zeros((3, 3, 2)), None, modes=modes, keep_body=True
+            masks, hanging, lost, np.zeros((frames, 3, 2)), None, modes=modes, keep_body=True
         )
         return poses, sigma[:, wrist]
 
