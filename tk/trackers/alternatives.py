@@ -64,6 +64,10 @@ class Alternative:
     begins: Float | None = None
     moves: bool = True
 
+    def begins_anew(self, frame: int) -> bool:
+        """Return whether it begins in a frame even if it is tracked: a search of this frame has found it."""
+        return not self.moves and self.begins is not None and bool(np.isfinite(self.begins[frame, self.dofs]).all())
+
 
 class Tracks(NamedTuple):
     """A alternatives, tracked through K frames in one direction.
@@ -187,7 +191,8 @@ class Choice:
             self._advance(2 * len(frames))
             for n, i in enumerate(frames.tolist()):
                 joined, last, present, poses = self._joined(i, step), i - step, self.poses[i], begun[:, n]
-                known, mean = mean if joined else nothing, nothing.copy()
+                anew = [not joined or one.begins_anew(i) for one in alternatives]
+                known, mean = np.where(anew, np.nan, mean), nothing.copy()
                 if tracked := np.flatnonzero(np.isfinite(known)).tolist():
                     some = [alternatives[k] for k in tracked]
                     starts = np.repeat(present[None, None], len(some), axis=0)
