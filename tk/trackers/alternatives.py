@@ -159,8 +159,8 @@ class Choice:
         other[np.ix_(found, one.dofs)] = poses[np.ix_(found, one.dofs)]
         joints = self.tracker.body.skeleton.joints(np.array([self.poses, other]))
         share = second_of_two(np.where(found, cost, 0.0), self._surprises(joints) / CHANGE_M)
-        apart = ((joints[1] - joints[0]) ** 2).sum(axis=-1) / 3
-        self.variance += (share * (1.0 - share))[:, None] * apart
+        square = ((joints[1] - joints[0]) ** 2).sum(axis=-1) / 3
+        self.variance += (share * (1.0 - share))[:, None] * square
         return other, (share > 0.5) & found
 
     def _surprises(self, joints: Float) -> Float:
