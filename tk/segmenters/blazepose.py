@@ -46,7 +46,7 @@ _ROWS = {
     "ankle_r": 28, "heel_l": 29, "heel_r": 30, "toe_l": 31, "toe_r": 32,
 }  # fmt: skip
 # Detections whose boxes, which hold the head, overlap by more (intersection over union) are one person: MediaPipe's
-# value. People who dance together have heads apart.
+# value. The heads of two dancers are apart.
 _SAME = 0.3
 
 
