@@ -27,7 +27,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from types import TracebackType
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -177,11 +177,11 @@ class _Order:
 
 @dataclass(frozen=True)
 class _Ready:
-    """A frame lies in a slot. ``frame``: without images and pixels; ``uncertain``: whether it has uncertain pixels."""
+    """A frame lies in a slot. ``frame``: without its layers; ``layers``: the names of those that it has."""
 
     slot: int
     frame: Frame
-    uncertain: bool
+    layers: tuple[str, ...]
     laps: Mapping[str, float]
 
 
@@ -194,21 +194,31 @@ class _Failed:
 
 
 class _Layout:
-    """Size of a slot, and the position of its layers: images, masks, uncertain pixels."""
+    """Size of a slot, and the place of a frame's layers in it. Messages are small: a large one would make the process
+    wait until the tracker reads it."""
 
     def __init__(self, rig: Rig, image_step: int) -> None:
-        self.masks = (len(rig), *rig.frame_shape)
+        masks = len(rig), *rig.frame_shape
         height, width = (side // image_step if image_step else 0 for side in rig.frame_shape)
-        self.images = (len(rig), height, width, 3)
+        #: fields of :class:`~tk.trackers.protocol.Frame`, their shapes and types
+        self._layers = {
+            "images": ((len(rig), height, width, 3), np.uint8),
+            "masks": (masks, np.uint8),
+            "uncertain": (masks, np.bool_),
+            "people": (masks, np.uint8),
+        }
         page = mmap.ALLOCATIONGRANULARITY
-        self.bytes = -(-(math.prod(self.images) + 2 * math.prod(self.masks)) // page) * page
+        self.bytes = -(-sum(math.prod(shape) for shape, _ in self._layers.values()) // page) * page
 
-    def layers(self, slot: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.bool_]]:
-        """Views of a slot (bytes,): images (C, H, W, 3), masks (C, H, W), uncertain (C, H, W)."""
-        a = math.prod(self.images)
-        b = a + math.prod(self.masks)
-        images, masks, uncertain = slot[:a], slot[a:b], slot[b : 2 * b - a].view(np.bool_)
-        return images.reshape(self.images), masks.reshape(self.masks), uncertain.reshape(self.masks)
+    def layers(self, slot: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
+        """Return views of a slot (bytes,)."""
+        found: dict[str, NDArray[Any]] = {}
+        begin = 0
+        for name, (shape, kind) in self._layers.items():
+            end = begin + math.prod(shape)
+            found[name] = slot[begin:end].view(kind).reshape(shape)
+            begin = end
+        return found
 
 
 # --- the tracker's side -----------------------------------------------------------------------------------------------
@@ -268,9 +278,9 @@ class Ahead:
         else:
             slot = slot.copy()
             self._send(ready.slot)
-        images, masks, uncertain = self._layout.layers(slot)
-        unsure = uncertain if ready.uncertain else None
-        return replace(ready.frame, images=images, masks=masks, uncertain=unsure)
+        layers = self._layout.layers(slot)
+        present: dict[str, Any] = {name: layers[name] for name in ready.layers}
+        return replace(ready.frame, **present)
 
     def _collect(self) -> None:
         """Make the dropped frames' slots free."""
@@ -340,13 +350,13 @@ class _Slots:
         while not self._free:
             self._free.append(self._tracker.receive())
         number, size = self._free.pop(), self._layout.bytes
-        images, masks, uncertain = self._layout.layers(np.frombuffer(self._memory, np.uint8, size, number * size))
-        images[...] = observation.images
-        masks[...] = observation.masks
-        if observation.uncertain is not None:
-            uncertain[...] = observation.uncertain
-        bare = replace(observation, images=images[:0, :0], masks=masks[:0, :0], uncertain=None)
-        self._tracker.send(_Ready(number, bare, observation.uncertain is not None, watch.laps))
+        layers = self._layout.layers(np.frombuffer(self._memory, np.uint8, size, number * size))
+        present = tuple(name for name in layers if getattr(observation, name) is not None)
+        for name in present:
+            layers[name][...] = getattr(observation, name)
+        none = np.empty((0, 0, 0), np.uint8)
+        bare = replace(observation, images=none, masks=none, uncertain=None, people=None)
+        self._tracker.send(_Ready(number, bare, present, watch.laps))
 
 
 def serve() -> None:
