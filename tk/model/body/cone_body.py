@@ -27,6 +27,7 @@ from tk.model.body.anthropometry import (
     PELVIS_FORWARD,
     BodyDimensions,
 )
+from tk.model.body.body_points import SEGMENT, places
 from tk.model.body.joints import ARM, CHAIN_OF_SEGMENT, CROOK, ELBOW_AXIS, LIMBS, ROWS, SEGMENTS, side_of
 from tk.model.body.skeleton import Skeleton, build_skeleton, cross, up_rotation
 
@@ -121,6 +122,13 @@ class ConeBody:
             moved=self.skeleton.contour_dof[segments],
         )
         return ConeArrays(self.skeleton.tree.astype(dtype), parts.astype(dtype), np.array(curves, np.int32))
+
+    @cached_property
+    def marked(self) -> Float:
+        """(L, 4) the points that landmarks mark, zero configuration, metres, and the last degree of freedom above."""
+        return np.column_stack([
+            places(self.dimensions) @ self.skeleton.T_world_body.T, self.skeleton.segment_dof[SEGMENT]
+        ])  # fmt: skip
 
     @cached_property
     def color_group(self) -> NDArray[np.int32]:

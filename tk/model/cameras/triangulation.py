@@ -76,31 +76,34 @@ def triangulate_joints(rig: Rig, joints: Float) -> tuple[Float, NDArray[np.bool_
 
     Args:
         rig: C cameras.
-        joints: (C, J, 3 or more) pixels x, y and confidence of one person; NaN where a joint is not visible. Further
-            columns do not count.
+        joints: (..., C, J, 3 or more) pixels x, y and confidence of one person, in one frame or in several; NaN where a
+            joint is not visible. Further columns do not count.
 
     Returns:
-        Points (J, 3), metres, NaN where no two cameras agree; and (C, J) bool, the inliers.
+        Points (..., J, 3), metres, NaN where no two cameras agree; and (..., C, J) bool, the inliers.
     """
-    joints = joints[..., :3]
-    rays = _Triangulator(rig)
-    C, J = joints.shape[:2]
-    seen = np.stack([rays.normalised(c, joints[c, :, :2]) for c in range(C)])
-    weight = _weights(joints)
-    gate = np.array([_gate_px(person) for person in joints])
+    rays, (*frames, C, count) = _Triangulator(rig), joints.shape[:-1]
+    each = joints[..., :3].reshape(-1, C, count, 3)  # (F, C, J, 3)
+    gate = np.repeat([[_gate_px(each[f, c]) for f in range(len(each))] for c in range(C)], count, axis=1)  # (C, F J)
+    every = each.swapaxes(0, 1).reshape(C, -1, 3)
+    J = every.shape[1]
+    seen = np.stack([rays.normalised(c, every[c, :, :2]) for c in range(C)])
+    weight = _weights(every)
     best, agreeing = np.full(J, -np.inf), np.zeros((C, J), bool)
     for a, b in combinations(range(C), 2):
         pair = np.zeros((C, J))
         pair[[a, b]] = weight[[a, b]]
         points = rays.triangulate(seen, pair)
         errors = np.stack([rays.errors_px(points, c, seen[c]) for c in range(C)])
-        inside = (errors < gate[:, None]) & (weight > 0)
+        inside = (errors < gate) & (weight > 0)
         with np.errstate(invalid="ignore"):
             valid = inside[a] & inside[b] & (rays.angle_deg(points, a, b) > _LEAST_ANGLE_DEG)
-        support = _support(errors, gate[:, None], weight).sum(axis=0)
+        support = _support(errors, gate, weight).sum(axis=0)
         better = valid & (support > best)
         best[better], agreeing[:, better] = support[better], inside[:, better]
-    return rays.triangulate(seen, np.where(agreeing, weight, 0.0)), agreeing
+    points = rays.triangulate(seen, np.where(agreeing, weight, 0.0))
+    agreeing = agreeing.reshape(C, -1, count).swapaxes(0, 1)
+    return points.reshape(*frames, count, 3), agreeing.reshape(*frames, C, count)
 
 
 def same_person(rig: Rig, people: Sequence[Float], inside: tuple[Float, Float]) -> Float:

@@ -20,14 +20,16 @@ landmarks it stays as it is.
 from __future__ import annotations
 
 from copy import copy
-from functools import cached_property
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.kernels.cone_arrays import NEAREST_M
+from tk.kernels.landmark_terms import LandmarkArrays, landmark_costs, landmark_information
 from tk.kernels.mask_values import PERSON
-from tk.model.body.body_points import LANDMARKS, POINTS, SEGMENT, places
+from tk.model.body.body_points import LANDMARKS, POINTS, SEGMENT
 from tk.model.body.cone_body import ConeBody
 from tk.model.body.initial_pose import figures
 from tk.model.body.joints import HIPS, JOINTS, SHOULDERS, side_of
@@ -70,15 +72,14 @@ INDEPENDENT = 0.5
 _OTHER_SIDE = {"_l": "_r", "_r": "_l", "": ""}
 _PARTNER = np.array([LANDMARKS.index(n.removesuffix(side_of(n)) + _OTHER_SIDE[side_of(n)]) for n in LANDMARKS])
 _LOWER = np.array([name[:-2] in ("hip", "knee", "ankle", "heel", "toe") for name in LANDMARKS])
-_HALVES = np.stack([~_LOWER, _LOWER]).astype(np.float64)  # (2, L)
-# Bones whose depth counts: the landmarks at their ends (K, 2), and which of them belong to the upper and lower half.
+# Bones whose depth counts: the landmarks at their ends (K, 2).
 _BONES = [("shoulder_l", "shoulder_r"), ("hip_l", "hip_r")] + [
     (parent + side, child + side)
     for parent, child in (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))
     for side in ("_l", "_r")
 ]
 _FROM, _TO = np.array([[LANDMARKS.index(name) for name in bone] for bone in _BONES]).T
-_BONE_HALVES = _HALVES[:, _FROM]  # (2, K)
+_HALF = np.concatenate([_LOWER, _LOWER[_FROM]]).astype(np.int32)  # (L + K,) 0 the upper one
 _SHARE = np.where(np.arange(len(_BONES)) < 2, *DEPTH_SHARE)  # (K,)
 # (L + K, L) the landmarks and their bones as sums of landmarks; (L + K, L L) the products of these sums' factors.
 _PLACES = np.eye(len(LANDMARKS))
@@ -90,26 +91,9 @@ _MIDDLE = {"pelvis": HIPS, "neck": SHOULDERS, "head_top": _FACE}
 _MARKED = {joint: [LANDMARKS.index(name) for name in _MIDDLE.get(joint, (joint,))] for joint in JOINTS}
 
 
-class _Match(NamedTuple):
-    """N measurements, of landmarks or of depths, in the V images, compared with B poses: each as it is named, and with
-    left and right exchanged. All arrays are (B, 2, V, N).
-
-    Attributes:
-        ratio: likelihood, relative to that of a wrong measurement.
-        right: probability that it is right.
-        weight: 1/variance, 1/m².
-        away: distances, metres; one array per axis.
-    """
-
-    ratio: Float
-    right: Float
-    weight: Float
-    away: tuple[Float, ...]
-
-
 class LandmarkRows(NamedTuple):
-    """Information of the landmarks about N = L + K places, the body's points and its bones (:func:`_with_bones`), at B
-    poses, with the landmarks' offsets integrated out."""
+    """Information of the landmarks about N = L + K places, the body's points and its bones, at B poses, with the
+    landmarks' offsets integrated out."""
 
     information: Float  # (B, 3, 3, N) 1/m²
     pull: Float  # (B, 3, N) the same times the distance to the landmarks, 1/m
@@ -138,75 +122,44 @@ class LandmarkCue:
     weight = WEIGHT
 
     def __init__(self, rig: Rig, body: ConeBody, seen: Float) -> None:
-        self._rig, self._skeleton, self._seen = rig, body.skeleton, seen
-        self._elsewhere, self._precision = float(np.log(ELSEWHERE)), 1.0
-        seen = _normalised(rig, seen)
-        self._place = places(body.dimensions) @ body.skeleton.T_world_body.T
+        self._rig, self._body, self._seen = rig, body, seen
+        self._elsewhere, self._precision = ELSEWHERE, 1.0
         self._size = size = body.dimensions.stature / AVERAGE_STATURE_M
-        known = known_landmarks(seen)
-        visibility = np.where(known, seen[..., 2], 0.0)
-        self._sigma = SEEN_M * size * HIDDEN ** (1.0 - visibility)  # (..., V, L)
-        self._right = np.where(known, right_share(visibility), 0.0)
-        self._at = np.where(known[..., None], seen[..., :2], 0.0)
+        frames = seen.reshape(-1, *seen.shape[-3:])  # (F, V, L, 4)
+        known = known_landmarks(frames)
+        at = np.where(known[..., None], _normalised(rig, frames)[..., :2], 0.0)
+        visibility = np.where(known, frames[..., 2], 0.0)
+        sigma, right = SEEN_M * size * HIDDEN ** (1.0 - visibility), np.where(known, right_share(visibility), 0.0)
+        marks = np.concatenate([at, np.stack([right, sigma**-2], axis=-1)], axis=-1)
         # what is hidden in the images is guessed in all of them alike
-        images = np.maximum(np.count_nonzero(known, axis=-2), 1)
-        mean = visibility.sum(axis=-2) / images  # (..., L)
+        mean = visibility.sum(axis=1) / np.maximum(np.count_nonzero(known, axis=1), 1)  # (F, L)
         offset = (OFFSET_M * size * HIDDEN ** (1.0 - mean)) ** 2
-        self._offset = np.concatenate([offset, _SHARE**2 * (offset[..., _FROM] + offset[..., _TO])], axis=-1)
-        self._depth = np.where(known, seen[..., 3], np.nan)
-        self._visibility = visibility
+        values = (
+            body.skeleton.tree,
+            body.marked,
+            np.column_stack([_FROM, _TO, _SHARE]),
+            _HALF,
+            _cameras(rig, at, visibility),
+            np.stack([marks, marks[..., _PARTNER, :]], axis=2),
+            _depths(np.where(known, frames[..., 3], np.nan), visibility, size),
+            np.concatenate([offset, _SHARE**2 * (offset[:, _FROM] + offset[:, _TO])], axis=1),
+        )
+        self._arrays = LandmarkArrays._make(map(np.ascontiguousarray, values))
         # (D,) or (F, D) precision of the angles that only landmarks show, where there are any
-        self._prior = np.any(known, axis=(-2, -1))[..., None] * body.skeleton.by_landmarks**-2.0
+        shown = known.any(axis=(1, 2)).reshape(seen.shape[:-3])
+        self._prior = shown[..., None] * body.skeleton.by_landmarks**-2.0
 
     def widened(self, factor: float) -> LandmarkCue:
         """Return the cue with standard deviations times a factor; if it exceeds 1, all images show the person."""
         result = copy(self)
-        result._elsewhere = float(np.log(ELSEWHERE)) if factor == 1.0 else -np.inf
+        result._elsewhere = ELSEWHERE if factor == 1.0 else 0.0
         result._precision = factor**-2
         return result
 
-    @cached_property
-    def _sight(self) -> Float:
-        """(..., V, 3) directions from the cameras to the person, world."""
-        at = np.concatenate([self._at, np.ones_like(self._at[..., :1])], axis=-1)
-        shown = (self._visibility[..., None] * at).sum(axis=-2)
-        ahead = np.where(shown[..., 2:] > 0, shown, [0.0, 0.0, 1.0])
-        return np.einsum("vji,...vj->...vi", self._cameras[0], ahead / np.linalg.norm(ahead, axis=-1, keepdims=True))
-
-    @cached_property
-    def _cameras(self) -> tuple[Float, Float]:
-        """(V, 3, 3), (V, 3) from the world to each camera."""
-        return np.array([c.rotation for c in self._rig]), np.array([c.translation for c in self._rig])
-
-    @cached_property
-    def _marks(self) -> tuple[Float, Float, Float, Float]:
-        """(..., 2, V, L) x and y on the plane at distance 1, probability of being right, and 1/variance, 1/m², of the
-        landmarks as named, and with left and right exchanged."""
-        values = (self._at[..., 0], self._at[..., 1], self._right, self._sigma**-2)
-        x, y, right, weight = (np.stack([value, value[..., _PARTNER]], axis=-3) for value in values)
-        return x, y, right, weight
-
-    @cached_property
-    def _depths(self) -> tuple[Float, Float, Float]:
-        """(..., 2, V, K) depths of the bones, metres, probability of being right, and 1/variance, 1/m², as named, and
-        with left and right exchanged."""
-        depth, visibility = (np.stack([v, v[..., _PARTNER]], axis=-3) for v in (self._depth, self._visibility))
-        seen = self._size * (depth[..., _TO] - depth[..., _FROM])
-        known, visibility = np.isfinite(seen), np.minimum(visibility[..., _TO], visibility[..., _FROM])
-        sigma = DEPTH_M * self._size * DEPTH_HIDDEN ** (1.0 - visibility)
-        return np.where(known, seen, 0.0), np.where(known, right_share(visibility), 0.0), sigma**-2
-
-    @cached_property
-    def _directions(self) -> tuple[Float, Float]:
-        """(9, 4 V), (..., 9, V) what the information about a point is linear in: see :meth:`_information`."""
-        x, y, z = np.swapaxes(self._cameras[0], 0, 1)  # (V, 3) each
-
-        def product(a: Float, b: Float) -> Float:
-            return (a[..., :, None] * b[..., None, :]).reshape(*a.shape[:-1], 9)
-
-        across = [product(x, x) + product(y, y), -product(x, z) - product(z, x), -product(y, z) - product(z, y)]
-        along = product(self._sight, self._sight)
-        return np.concatenate([*across, product(z, z)]).T.copy(), np.ascontiguousarray(along.swapaxes(-1, -2))
+    @property
+    def _numbers(self) -> Float:
+        """The model's numbers for the kernel."""
+        return _numbers(self._elsewhere, self._precision)
 
     def normal(self, poses: Float) -> Quadratic:
         """Return the negative logarithm of the likelihood, and of the prior of the angles that only landmarks show, as
@@ -218,12 +171,7 @@ class LandmarkCue:
 
     def rows(self, poses: Float) -> LandmarkRows:
         """Return the information of the landmarks about the body's points at poses (B, D)."""
-        x = self._skeleton.points(poses, SEGMENT, self._place)
-        found, pull = self._information(x.swapaxes(1, 2))[1:]
-        inverse = INDEPENDENT * _inverse_with(found, self._offset)[0]
-        jacobian = self._skeleton.point_jacobian(poses, SEGMENT, x)
-        # both are symmetric and commute
-        return LandmarkRows(_product(inverse[:, None], found), _product(inverse, pull), jacobian)
+        return LandmarkRows(*landmark_information(self._arrays, self._numbers, poses))
 
     def cost(self, poses: Float) -> Float:
         """Return (B,) the same at poses (B, D), nats, up to a constant of the frame.
@@ -231,16 +179,7 @@ class LandmarkCue:
         The offsets are integrated out by Laplace's method, about the offsets that one step of Newton's gives. They
         explain what all images have in common; a landmark far off in one image is not explained by them.
         """
-        x, L = self._skeleton.points(poses, SEGMENT, self._place).swapaxes(1, 2), len(LANDMARKS)
-        cost, information, pull = self._information(x)
-        variance = self._offset[..., :L]
-        inverse, determinant = _inverse_with(information[..., :L], variance)
-        variance = variance[..., None, :]
-        offset = variance * _product(inverse, pull[..., :L])
-        moved = self._likelihood(x + offset)[0] + 0.5 * (offset**2 / variance).sum(axis=(-2, -1))
-        volume = 0.5 * np.log(determinant).sum(axis=-1)
-        # where the step leaves a landmark's normal part, it is too long, and no offset is better
-        cost = INDEPENDENT * (np.minimum(moved, cost) + volume)
+        cost = landmark_costs(self._arrays, self._numbers, poses)
         return np.asarray(cost + 0.5 * (self._prior * poses**2).sum(axis=-1))
 
     def variance(self, poses: Float) -> Float:
@@ -250,104 +189,46 @@ class LandmarkCue:
         Pose or landmark may be right, so half of the squared distance counts. Neck and pelvis have the mean of
         shoulders and hips, the crown that of the face.
         """
-        x = self._skeleton.points(poses, SEGMENT, self._place)
+        x = points(self._body, poses)
         each = np.broadcast_to(self._seen, (len(poses), *self._seen.shape[-3:]))
-        known, points = known_landmarks(each), np.full(x.shape, np.nan)
-        for b in np.flatnonzero(known.any(axis=(1, 2))):
-            points[b] = triangulate_joints(self._rig, each[b])[0]
-        square = ((x - points) ** 2).sum(axis=-1)
+        known, found = known_landmarks(each), np.full(x.shape, np.nan)
+        if (some := np.flatnonzero(known.any(axis=(1, 2)))).size:
+            found[some] = triangulate_joints(self._rig, each[some])[0]
+        square = ((x - found) ** 2).sum(axis=-1)
         visibility = np.where(known, each[..., 2], 0.0).sum(axis=-2) / np.maximum(known.sum(axis=-2), 1)
         expected = 3 * (deviation(visibility) * self._size) ** 2
         excess = right_share(visibility) * np.maximum(np.where(np.isfinite(square), square, 0.0) - expected, 0.0) / 6
         return np.stack([excess[:, rows].mean(axis=1) for rows in _MARKED.values()], axis=1)
 
-    def _information(self, x: Float) -> tuple[Float, Float, Float]:
-        """Return the landmarks' likelihood if the body's points are at x (B, 3, L): its negative logarithm (B,), if all
-        landmarks were independent; the information (B, 3, 3, L + K) about each point and each bone, and its product
-        (B, 3, L + K) with the distance to the landmarks.
 
-        An image shows a point's position across the ray: with the point at (u, v) on the plane at distance 1, the
-        derivatives are the rows (1, 0, -u) and (0, 1, -v) in the camera's frame.
-        """
-        (B, _, L), V = x.shape, len(self._rig)
-        cost, q, marks, depths, named = self._likelihood(x)
-        w = named @ _HALVES * marks.right * marks.weight  # (B, 2, V, L)
-        u, v = q[:, :, 0] / q[:, :, 2], q[:, :, 1] / q[:, :, 2]
-        total, (pull_x, pull_y) = w[:, 0] + w[:, 1], ((w * away).sum(axis=1) for away in marks.away)
-        moments = np.stack([total, total * u, total * v, total * (u * u + v * v)], axis=1)  # (B, 4, V, L)
-        across, along = self._directions
-        pulls = np.stack([pull_x, pull_y, -u * pull_x - v * pull_y], axis=2).reshape(B, 3 * V, L)
-        w = named @ _BONE_HALVES * depths.right * depths.weight  # (B, 2, V, K)
-        information = [across @ moments.reshape(B, 4 * V, L), along @ w.sum(axis=1)]
-        bone_pull = np.swapaxes(self._sight, -1, -2) @ (w * depths.away[0]).sum(axis=1)
-        pull = [self._cameras[0].reshape(3 * V, 3).T @ pulls, bone_pull]
-        return cost, np.concatenate(information, axis=2).reshape(B, 3, 3, -1), np.concatenate(pull, axis=2)
-
-    def _likelihood(self, x: Float) -> tuple[Float, Float, _Match, _Match, Float]:
-        """Return the negative logarithm (B,) of :meth:`_information`; the points (B, V, 3, L) in the cameras' frames,
-        with a depth of 1 behind a camera; what landmarks and depths are compared with; and the probability
-        (B, 2, V, halves) that an image shows the person with each half as named, and exchanged."""
-        (B, _, L), V = x.shape, len(self._rig)
-        rotation, translation = self._cameras
-        q = (rotation.reshape(3 * V, 3) @ x).reshape(B, V, 3, L) + translation[:, :, None]
-        behind = q[:, :, 2] <= 0.1
-        q[:, :, 2][behind] = 1.0
-        marks, depths = self._match(q, behind), self._match_depth(_with_bones(x)[..., L:])
-        halves = np.stack(
-            [
-                np.prod(marks.ratio[..., points], axis=-1) * np.prod(depths.ratio[..., bones], axis=-1)
-                for points, bones in zip(_HALVES > 0, _BONE_HALVES > 0, strict=True)
-            ],
-            axis=-1,
-        )  # (B, 2, V, halves)
-        halves *= np.array([1.0 - EXCHANGED, EXCHANGED])[:, None, None]
-        total = halves[:, 0] + halves[:, 1]
-        image = np.log(total).sum(axis=-1) + np.log(1.0 - ELSEWHERE)  # (B, V)
-        image_total = np.logaddexp(image, self._elsewhere)
-        named = halves / total[:, None] * np.exp(image - image_total)[:, None, :, None]
-        return -image_total.sum(axis=-1), q, marks, depths, named
-
-    def _match(self, q: Float, behind: NDArray[np.bool_]) -> _Match:
-        """Compare the landmarks with points (B, V, 3, L) in the cameras' frames, of which some are ``behind``
-        (B, V, L)."""
-        x, y, right, weight = self._marks
-        right, weight = np.where(behind[:, None], 0.0, right), self._precision * weight
-        q_x, q_y, depth = (q[:, None, :, axis] for axis in range(3))
-        away = x * depth - q_x, y * depth - q_y
-        inside = right * weight / (2 * np.pi) * np.exp(-0.5 * weight * (away[0] ** 2 + away[1] ** 2))
-        both = inside + (1.0 - right) * WRONG_DENSITY
-        return _Match(both / WRONG_DENSITY, inside / both, weight, away)
-
-    def _match_depth(self, bones: Float) -> _Match:
-        """Compare the depths with bones (B, 3, K), as :func:`_with_bones` has them."""
-        seen, right, weight = self._depths
-        weight = self._precision * weight
-        away = seen - (self._sight @ bones)[:, None]
-        inside = right * np.sqrt(weight / (2 * np.pi)) * np.exp(-0.5 * weight * away**2)
-        both = inside + (1.0 - right) * WRONG_DENSITY
-        return _Match(both / WRONG_DENSITY, inside / both, weight, (away,))
+@cache
+def _numbers(elsewhere: float, precision: float) -> Float:
+    """Return the model's numbers in the order of :data:`tk.kernels.landmark_terms.WRONG` and those after it."""
+    other = np.log(elsewhere) if elsewhere else -np.inf
+    shown = np.log(1 - ELSEWHERE)
+    return np.array([WRONG_DENSITY, EXCHANGED, shown, other, precision, INDEPENDENT, NEAREST_M, 2 * np.pi])
 
 
-def _product(matrix: Float, values: Float) -> Float:
-    """Return the products (..., 3, N) of N matrices (..., 3, 3, N) with vectors (..., 3, N)."""
-    first, second, third = (matrix[..., k, :] * values[..., None, k, :] for k in range(3))
-    return first + second + third
+def _cameras(rig: Rig, at: Float, visibility: Float) -> Float:
+    """Return (F, V, 15) transforms (3, 4) from the world to each camera, and directions from it to the person, whose
+    landmarks are at (F, V, L, 2) on the plane at distance 1."""
+    rotation = np.array([c.rotation for c in rig])
+    world = np.concatenate([rotation, np.array([c.translation for c in rig])[..., None]], axis=2).reshape(-1, 12)
+    weight = visibility[..., None]
+    ahead = np.concatenate([(weight * at).sum(axis=2), weight.sum(axis=2)], axis=2)
+    ahead = np.where(ahead[..., 2:] > 0, ahead, [0.0, 0.0, 1.0])
+    sight = np.einsum("vji,fvj->fvi", rotation, ahead / np.linalg.norm(ahead, axis=-1, keepdims=True))
+    return np.concatenate([np.broadcast_to(world, (*sight.shape[:2], 12)), sight], axis=2)
 
 
-def _inverse_with(information: Float, variance: Float) -> tuple[Float, Float]:
-    """Return the inverse (B, 3, 3, N) and the determinant (B, N) of 1 + information · variance, of symmetric matrices
-    (B, 3, 3, N) and numbers (N,) or (B, N)."""
-    a, b, c, d, e, f = (variance * information[:, i, k] + (i == k) for i in range(3) for k in range(i, 3))
-    rows = d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b
-    determinant = a * rows[0] + b * rows[1] + c * rows[2]
-    inverse = np.stack([rows[k] for k in (0, 1, 2, 1, 3, 4, 2, 4, 5)], axis=1) / determinant[:, None]
-    return inverse.reshape(information.shape), determinant
-
-
-def _with_bones(values: Float) -> Float:
-    """Return values (..., L) of the landmarks, and those of the bones, (..., L + K): the part of the difference between
-    their ends that a network's depth keeps."""
-    return np.concatenate([values, _SHARE * (values[..., _TO] - values[..., _FROM])], axis=-1)
+def _depths(depth: Float, visibility: Float, size: float) -> Float:
+    """Return (F, V, 2, K, 3) depths of the bones, metres, probability of being right, and 1/variance, 1/m², as named,
+    and with left and right exchanged, from depth and visibility (F, V, L) of the landmarks."""
+    depth, visibility = (np.stack([v, v[..., _PARTNER]], axis=2) for v in (depth, visibility))
+    seen = size * (depth[..., _TO] - depth[..., _FROM])
+    known, visibility = np.isfinite(seen), np.minimum(visibility[..., _TO], visibility[..., _FROM])
+    sigma = DEPTH_M * size * DEPTH_HIDDEN ** (1.0 - visibility)
+    return np.stack([np.where(known, seen, 0.0), np.where(known, right_share(visibility), 0.0), sigma**-2], axis=-1)
 
 
 def known_landmarks(seen: Float) -> NDArray[np.bool_]:
@@ -415,8 +296,8 @@ def propose(rig: Rig, body: ConeBody, seen: Float, p_near: Float) -> Float:
 
 
 def points(body: ConeBody, pose: Float) -> Float:
-    """Return the places (L, 3) of the landmarks of a body at a pose (D,), in its world, metres."""
-    return body.skeleton.points(pose, SEGMENT, places(body.dimensions) @ body.skeleton.T_world_body.T)
+    """Return the places (..., L, 3) of the landmarks of a body at poses (..., D), in its world, metres."""
+    return body.skeleton.points(pose, SEGMENT, body.marked[:, :3])
 
 
 def of_person(landmarks: Float | None, masks: NDArray[np.uint8]) -> Float | None:
