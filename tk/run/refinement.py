@@ -42,21 +42,20 @@ def refine_rig(
     how = how or RefinementSettings()
     late = np.zeros(len(rig), np.int64) if late is None else late
     done: Refined | None = None
+    begun_late = late
     for _ in range(_SHIFTS):
         chosen = _chosen(people, Views(rig), SCALES, True, late)
         if chosen is None:
             break
-        before = None if done is None else done.before_px
-        done = refine_cameras(chosen, rig, how)
-        done = replace(
-            done,
-            offset_frames=done.offset_frames + late,
-            before_px=done.before_px if before is None else before,
-        )
+        first = done
+        done = refine_cameras(chosen, rig, how, first, late - begun_late)
+        done = replace(done, offset_frames=done.offset_frames + late)
+        if first is not None:
+            done = replace(done, before_px=first.before_px)
         whole = np.round(done.offset_frames).astype(np.int64)
         if (whole == late).all():
             break
-        late = whole
+        begun_late, late = late, whole
     return done
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -60,6 +61,17 @@ class PeopleBundle:
     def start(self) -> States:
         """The given cameras, poses and bodies."""
         return tuple(bundle.start for bundle in self.bundles)
+
+    def begun_at(self, states: States, late: NDArray[np.int64]) -> States:
+        """Return the given poses, with the cameras and bodies of estimates from other frames; a camera's frames are
+        ``late`` (C,) frames later here."""
+        moved = np.zeros((len(self.sigma), len(self.rig)))
+        if "offset" in self.parameters:  # it comes last
+            moved[-1] = late
+        return tuple(
+            replace(new, rig=old.rig, change=old.change - moved.T, body=old.body)
+            for new, old in zip(self.start, states, strict=True)
+        )
 
     def offsets(self, states: States) -> Float:
         """Return the time offset (C,) of each camera, frames."""

@@ -20,7 +20,7 @@ from tk.errors import ConfigError
 from tk.model.cameras.agreement import CAMERA_SEARCH, OFFSET_FRAMES, SCALE_DEVIATION
 from tk.model.cameras.bundle import CAMERA_PARAMETERS, LONGEST_STEP, residual_px
 from tk.model.cameras.camera import Camera, Rig
-from tk.model.cameras.people_bundle import Filmed, PeopleBundle
+from tk.model.cameras.people_bundle import Filmed, PeopleBundle, States
 from tk.optim.trajectory import gauge_projection, minimise
 
 Float = NDArray[np.float64]
@@ -77,15 +77,24 @@ class Refined:
     after_px: Float
     converged: bool  # whether the last steps were small
     frame_count: int  # number of frames used
+    states: States  # the estimate of each person
 
 
-def refine_cameras(people: Sequence[Filmed], rig: Rig, config: RefinementSettings | None = None) -> Refined:
+def refine_cameras(
+    people: Sequence[Filmed],
+    rig: Rig,
+    config: RefinementSettings | None = None,
+    begun: Refined | None = None,
+    late: NDArray[np.int64] | None = None,
+) -> Refined:
     """Adjust C cameras to frames of tracked bodies; see the module.
 
     Args:
         people: the bodies, in a world in which z is up, with frames whose pyramids have :data:`SCALES` scales.
         rig: the cameras as calibrated.
         config: see :class:`RefinementSettings`.
+        begun: a result of the same people, whose cameras and bodies are the first estimate; None: the given ones.
+        late: (C,) by how many frames more than for ``begun`` the cameras' images have been chosen later.
     """
     config = config or RefinementSettings()
     sigmas = {"turn": np.radians(TURN_DEG) * config.trust, "move": MOVE_M * config.trust}
@@ -94,11 +103,14 @@ def refine_cameras(people: Sequence[Filmed], rig: Rig, config: RefinementSetting
     bundle = PeopleBundle(people, SCALE_DEVIATION, rig, CAMERA_SEARCH, sigmas)
     C, sigma = len(rig), np.tile(bundle.sigma, len(rig))
     others = np.full(bundle.size - len(sigma), np.inf)
+    start, coarse = bundle.start, COARSE_ROUNDS
+    if begun is not None and late is not None and len(begun.states) == len(start):
+        start, coarse = bundle.begun_at(begun.states, late), 0
     solution = minimise(
-        bundle.start,
+        start,
         bundle.linearise,
         bundle.move,
-        [1] * COARSE_ROUNDS + [0] * ROUNDS,
+        [1] * coarse + [0] * ROUNDS,
         (LONGEST_STEP[0], np.concatenate([np.full(len(sigma), np.inf), np.full(len(others), LONGEST_STEP[1])])),
         np.concatenate([_SMALL * sigma, others]),
     )
@@ -123,6 +135,7 @@ def refine_cameras(people: Sequence[Filmed], rig: Rig, config: RefinementSetting
         after_px=residual_px(bundle.contours(final, 0), C) * rig.reductions,
         converged=solution.converged,
         frame_count=sum(len(frames) for _, frames in people),
+        states=final,
     )
 
 
