@@ -44,6 +44,7 @@ def pieces(path: str, masks: str) -> None:
     from tk.people.find import PeopleFinder
     from tk.people.people import People
     from tk.run.plan import open_plan, recording_task
+    from tk.run.segmentation import sources_of_masks
     from tk.run.task import RecordingOptions
     from tk.threads import one_thread
     from tk.trackers import contour_finder
@@ -71,7 +72,7 @@ def pieces(path: str, masks: str) -> None:
         done("tracker, without its kernels")
         frames = plan.observations.frames(plan.first, plan.stop)
         with mock.patch.object(kernel, "materialize", timed("transformation of kernels", kernel.materialize)):
-            plan.tracker.prepare()
+            plan.tracker.prepare(bool(sources_of_masks(task.source)))
         transformed = spent["transformation of kernels"]
         begun += transformed
         done("kernels from the cache")

@@ -27,7 +27,7 @@ from tk.people.person import Answer
 from tk.run.offline import REFINED
 from tk.run.plan import Plan
 from tk.run.prefetch import Observed
-from tk.run.segmentation import landmark_asker
+from tk.run.segmentation import landmark_asker, sources_of_masks
 from tk.threads import one_thread
 from tk.trackers.protocol import Estimate, Frame, shows_person, two_pass
 
@@ -130,7 +130,7 @@ class Loop:
         count = self._opening_frames()
         observations = plan.observations.frames(plan.first, None if plan.stop is None else plan.stop + count)
         _LOG.info("reading the first frames and learning what the scene looks like")
-        plan.tracker.prepare()
+        plan.tracker.prepare(bool(sources_of_masks(plan.task.source)))
         yield from self._step_through(self._started(observations, count))
         if not self.people.written:
             raise CaptureError(f"{plan.task.source.where}: nobody could be tracked: {self.people.refusal}")

@@ -182,14 +182,17 @@ class ContourFinder:
             self.colors.state = known
         self.limbs = limbs_of(body)
 
-    def prepare(self) -> None:
-        """Compile the kernels; otherwise each is compiled when it is first called."""
+    def prepare(self, with_landmarks: bool) -> None:
+        """See :class:`~tk.trackers.protocol.Tracker`; otherwise each is compiled when it is first called."""
         body = build_cone_body(AVERAGE_BODY)
         empty = np.zeros((len(self.views.rig), *self.views.rig.frame_shape), np.uint8)
         seen = self.views.pyramid(empty, 1, False)
         pose = np.zeros((1, len(body.skeleton.names)))
         normal_equations(body.arrays, self.views.at(seen, 0), pose, self.line_search)
         Evidence.of(self.coarse_grid, empty).mismatch(body, pose)
+        if with_landmarks:
+            unknown = np.full((len(empty), len(landmarks.LANDMARKS), 4), np.nan)
+            landmarks.LandmarkCue(self.views.rig, body, unknown).cost(pose)
 
     # --- initialisation (silhouette paper, section 4.6) ---------------------------------------------------------
 

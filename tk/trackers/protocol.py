@@ -182,8 +182,8 @@ class Tracker(Protocol):
         """The subject's body; only after :meth:`start` or :meth:`take_model`."""
         ...
 
-    def prepare(self) -> None:
-        """Compile kernels while there is nothing else to do."""
+    def prepare(self, with_landmarks: bool) -> None:
+        """Compile kernels while there is nothing else to do; ``with_landmarks``: the frames will have some."""
         ...
 
     def anticipate(self, frame: Frame, subject: Subject) -> None:

@@ -131,9 +131,9 @@ class SecondPass:
         """Optimise every frame by itself from its pose of the first pass, which other cameras have given; give each its
         residual."""
         for frames in _chunks(self.tracked):
-            for level in (LEVEL, 0):
-                seen = Pyramid.of_all([self._pyramid(i, LEVEL + 1) for i in frames], level)
-                self.poses[frames] = self.tracker.settle(seen, self.poses[frames], (level,)).states
+            coarse = Pyramid.of_all([self._pyramid(i, LEVEL + 1) for i in frames], LEVEL)
+            self.poses[frames] = self.tracker.settle(coarse, self.poses[frames], (LEVEL,)).states
+            seen = self._together(frames)
             label = self.tracker.coarse_grid.render(self.tracker.body, self.poses[frames]).label
             self.residual[frames] = self._residual(seen, label)
 

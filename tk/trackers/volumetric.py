@@ -127,9 +127,9 @@ class VolumetricTracker(Stateful[VolumetricState]):
 
     # --- initialisation (section 6.3) ---------------------------------------------------------------------------
 
-    def prepare(self) -> None:
-        """Compile the kernels of the initialisation ahead of its first frame."""
-        self._finder.prepare()
+    def prepare(self, with_landmarks: bool) -> None:
+        """See :class:`~tk.trackers.protocol.Tracker`."""
+        self._finder.prepare(with_landmarks)
 
     def anticipate(self, frame: Frame, subject: Subject) -> None:
         """See :class:`~tk.trackers.protocol.Tracker`."""
