@@ -82,6 +82,12 @@ def block(left: int, right: int, depth_m: float) -> RenderedBody:
     return RenderedBody(label, np.where(label > 0, np.float32(depth_m), np.float32(FAR)))
 
 
+def in_color(body: RenderedBody, color: np.ndarray) -> RenderedBody:
+    """Return the body with all parts of one known colour."""
+    colored = expected(POSES[0], color)
+    return body._replace(group=colored.group, log_likelihood=colored.log_likelihood)
+
+
 def masks_of(*bodies: RenderedBody) -> Frame:
     """Return an observation without images whose masks show the bodies."""
     shown = np.any([body.label > 0 for body in bodies], axis=0)
@@ -180,3 +186,33 @@ def test_a_network_s_mask_that_fits_no_body_shows_somebody_unknown() -> None:
             people[view] |= enlarged(label, GRID.step, SHAPE[1:]) << n
     owner = GRID.sample(assign(RIG, GRID, [known], replace(frame, people=people)).owner)
     assert (owner[:, 12:38, 6:16] == 0).all() and (owner[:, 12:38, 20:30] == NOBODY).all()
+
+
+def test_a_pixel_of_another_color_is_in_doubt_for_its_owner_and_for_who_has_the_color() -> None:
+    """A hand of the second person lies on the first one's trunk, where it is not expected."""
+    bodies = [in_color(block(2, 18, 3.0), COLORS[0]), in_color(block(20, 36, 3.0), COLORS[1])]
+    frame, hand = masks_of(*bodies), np.zeros(GRID.rays.shape[:3], np.bool_)
+    hand[:, 20:24, 12:14] = True
+    color = np.where(np.arange(GRID.rays.shape[2]) < 19, 0, 1)
+    cells = np.where(hand, 1, color[None, None])
+    images = np.array([enlarged(COLORS[view], GRID.step, SHAPE[1:]) for view in cells])
+    frame = replace(frame, images=images)
+    found = assign(RIG, GRID, bodies, frame)
+    assert (GRID.sample(found.owner)[hand] == 0).all()
+    for person in (0, 1):
+        doubt = found.share(frame, person).doubt
+        assert doubt is not None and (doubt[hand] == 1).all() and not doubt[~hand].any()
+    far = [bodies[0], bodies[1]._replace(depth=np.where(bodies[1].label > 0, np.float32(30), np.float32(FAR)))]
+    doubt = assign(RIG, GRID, far, frame).share(frame, 1).doubt  # the hand is two metres from the body
+    assert doubt is not None and not doubt.any()
+
+
+def test_a_color_that_suits_both_or_is_unknown_leaves_no_doubt() -> None:
+    blocks = [block(2, 18, 3.0), block(20, 36, 3.0)]
+    frame = replace(masks_of(*blocks), images=np.broadcast_to(COLORS[0], (*SHAPE, 3)))
+    doubt = assign(RIG, GRID, [in_color(one, COLORS[0]) for one in blocks], frame).share(frame, 0).doubt
+    assert doubt is not None and not doubt.any()
+    one_known = [in_color(blocks[0], COLORS[0]), blocks[1]]
+    doubts = [assign(RIG, GRID, one_known, frame).share(frame, person).doubt for person in (0, 1)]
+    assert all(doubt is not None and not doubt.any() for doubt in doubts)
+    assert assign(RIG, GRID, blocks, frame).share(frame, 0).doubt is None

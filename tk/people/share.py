@@ -9,6 +9,11 @@ hidden, so a part costs nothing, and no contour is searched. Every pixel has one
 as likely: in an embrace these are the arms, and without them the arms are not found. Somebody who has no body yet is
 unknown: pixels far from all bodies, and what has no colour of the bodies beside them.
 
+The owner may be wrong: a forearm that is not where it is expected, in front of another person's trunk, goes to the
+trunk. But its colour is likelier on the arm's owner. Such a pixel is in doubt: the person who does not get it pays for
+not explaining it, and the person who gets it learns less from its colour. Otherwise the trunk would learn the colours
+of the arm, and its pixels would never be in doubt again.
+
 The bodies are where they are expected, and a limb may be elsewhere. Its pixels then belong to the body that happens to
 be nearest, so that the limb would never be found again. Therefore a pixel that no body covers is evidence for everybody
 in reach.
@@ -29,7 +34,7 @@ from tk.kernels.line_search import COLOR_BINS, MOST_LOG_RATIO
 from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.cameras.camera import Rig
 from tk.model.cues.landmarks import LEAST_OVERLAP
-from tk.model.cues.part_colors import RenderedBody, color_bins
+from tk.model.cues.part_colors import RenderedBody, color_bins, deficit
 from tk.model.cues.ray_costs import RayGrid
 from tk.model.reduced_images import crop
 from tk.trackers.protocol import Frame
@@ -71,6 +76,7 @@ class PixelOwners:
     people: int  # number of people, also those whose body is unknown
     # (V, h, w) bit k: no body covers the cell, and person k is in reach of it; see `share`
     free: NDArray[np.uint32]
+    doubt: Single | None  # (K, V, h, w) of each person, see `Frame`; None without colours
 
     def share(self, frame: Frame, person: int, unknown: bool = False) -> Frame:
         """Return the observation of a person, with the pixels of others as :data:`~tk.kernels.mask_values.OTHERS`.
@@ -80,7 +86,8 @@ class PixelOwners:
 
         ``unknown``: pixels of somebody unknown may show this person.
         """
-        return replace(frame, masks=self._masks(frame, (person, NOBODY) if unknown else (person,), person))
+        masks = self._masks(frame, (person, NOBODY) if unknown else (person,), person)
+        return replace(frame, masks=masks, doubt=None if self.doubt is None else self.doubt[person])
 
     def unknown(self, frame: Frame) -> Frame:
         """Return the observation of people who are unknown; pixels of known people are
@@ -151,6 +158,8 @@ def assign(rig: Rig, grid: RayGrid, bodies: Sequence[RenderedBody | None], frame
     least = STRANGER_SHARE * float(np.median(areas)) if areas else 0.0
     claims = _claims(grid, frame, bodies, shown)
     colored = frame.images.size > 0 and any(body is not None and body.log_likelihood is not None for body in bodies)
+    bins = color_bins(grid.sample(frame.images)) if colored else None
+    doubt = np.zeros((len(bodies), *shown.shape), np.float32) if colored else None
     for v, camera in enumerate(rig):
         cells = _around(shown[v])
         cell = grid.step / float(camera.matrix[0, 0])
@@ -168,7 +177,10 @@ def assign(rig: Rig, grid: RayGrid, bodies: Sequence[RenderedBody | None], frame
         image = crop(frame.images[v], frame.masks.shape[1:], *pixels) if colored else None
         free[v][cells] = view.free()
         owner[v][pixels] = view.owners(frame.masks[v][pixels] >= PERSON, image)
-    return PixelOwners(grid, owner, len(bodies), free)
+        if bins is not None and doubt is not None:
+            for number, one in view.doubt(grid.sample(owner[None, v])[0][cells], bins[v][cells]).items():
+                doubt[number, v][cells] = one
+    return PixelOwners(grid, owner, len(bodies), free, doubt)
 
 
 def _claims(grid: RayGrid, frame: Frame, bodies: Sequence[RenderedBody | None], shown: Bool) -> dict[int, Bool]:
@@ -253,6 +265,20 @@ class _View:
             if shape.number != NOBODY:
                 found |= (bare & (shape.away <= REACH_M)).astype(np.uint32) << np.uint32(shape.number)
         return found
+
+    def doubt(self, owner: NDArray[np.int8], bins: NDArray[np.int32]) -> dict[int, Single]:
+        """Return (h, w) the doubt of each person about the owners (h, w) of cells with colours (h, w), see
+        :class:`~tk.trackers.protocol.Frame`. Cells that no body covers have none, see :meth:`free`."""
+        covered = self._shown & (_nearest(self._shapes) <= NEAR_M)
+        of_owner, likelier = np.full(bins.shape, np.inf, np.float32), {}
+        for shape in self._shapes:
+            if shape.body is not None and shape.body.log_likelihood is not None:
+                np.copyto(of_owner, _log_color(shape, shape.label, bins), where=owner == shape.number)
+                of_parts = shape.body.log_likelihood[:-1].max(axis=0)
+                likelier[shape.number] = np.where(covered & (shape.away <= REACH_M), of_parts.take(bins), -np.inf)
+        found = {n: np.where(owner == n, np.float32(0), deficit(one, of_owner)) for n, one in likelier.items()}
+        most = functools.reduce(np.maximum, found.values(), np.zeros(bins.shape, np.float32))
+        return {n: np.where(owner == n, most, one) for n, one in found.items()}
 
     def owners(self, person: Bool, image: NDArray[np.uint8] | None) -> NDArray[np.int8]:
         """Return (H, W) the owners of pixels, by the colours where the bodies alone do not decide.

@@ -414,8 +414,10 @@ class ContourFinder:
 
     def evidence(self, grid: RayGrid, frame: Frame, pyramid: Pyramid) -> Evidence:
         """Return the costs of a frame on a grid of rays, and by its cues."""
-        colors = self.colors if frame.images.size else None
-        return Evidence.of(grid, pyramid.masks[0], frame.uncertain, frame.images, colors, self.cues(pyramid))
+        colors, doubt = (self.colors, frame.doubt) if frame.images.size else (None, None)
+        if doubt is not None:
+            doubt = grid.nearest(self.fine_grid, doubt)
+        return Evidence.of(grid, pyramid.masks[0], frame.uncertain, frame.images, colors, self.cues(pyramid), doubt)
 
     def see(self, frame: Frame, images: NDArray[np.uint8] | None = None, pyramid: Pyramid | None = None) -> Seen:
         """Return what a frame shows; ``images`` as in :meth:`settle`, ``pyramid`` that of the frame, if known."""

@@ -48,6 +48,9 @@ class Frame:
             network saw this frame.
         ask: returns the landmarks (C, L, 4) of the person whose landmarks are expected at places (L, 3), world frame,
             metres, or None; None if no network can be asked.
+        doubt: (C, h, w) in [0, 1], on the tracker's ``fine_grid``: by how much likelier, by its colour, a pixel is
+            another person's than its owner's (see :func:`~tk.model.cues.part_colors.deficit`): of a pixel of the
+            subject any other person's, of other pixels the subject's. None if nothing is in doubt.
     """
 
     index: int
@@ -59,6 +62,7 @@ class Frame:
     landmarks: NDArray[np.float64] | None = None
     people: NDArray[np.uint8] | None = None
     ask: Callable[[Float], Float | None] | None = None
+    doubt: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)

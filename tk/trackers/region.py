@@ -455,9 +455,11 @@ class RegionTracker(ContourTracker[RegionState]):
         return self._lost_for > 0 if error <= limit else self._lost_for % RECOVER_EVERY == 0
 
     def _learn(self, evidence: Evidence, look: _Look) -> None:
-        """Update the baseline of the residual; the colours, too, if E_S is not above the baseline."""
+        """Update the baseline of the residual; the colours, too, if E_S is not above the baseline. A pixel counts less,
+        the more in doubt it is."""
+        person, doubt = evidence.person, evidence.doubt
         if self.config.colors and evidence.bins is not None and self.residuals.mean_excess(look.error) <= 0:
-            self.colors.learn(evidence.bins[evidence.person], look.label[evidence.person])
+            self.colors.learn(evidence.bins[person], look.label[person], None if doubt is None else 1 - doubt[person])
         self.residuals.learn(look.residual)
 
     def _look(self, seen: Seen) -> _Look:

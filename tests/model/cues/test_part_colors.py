@@ -91,6 +91,18 @@ def test_new_colors_are_learned_slowly():
     assert (np.diff(suits[1:]) > 0).all()
 
 
+def test_a_pixel_is_learned_by_its_weight():
+    colors, expected = PartColors(BODY), PartColors(BODY)
+    torso = NAMES.index("chest") + 1
+    red, green = bin_of((0, 0, 250)), bin_of((0, 250, 0))
+    bins, label = np.repeat([red, green, green, red], 100), np.repeat([torso, torso, torso, 0], 100).astype(np.uint8)
+    colors.learn(bins, label, np.repeat(np.float32([1, 0.5, 0, 0.25]), 100))
+    kept = np.r_[:150, 300:325]
+    expected.learn(bins[kept], label[kept])
+    np.testing.assert_allclose(colors.state.counts, expected.state.counts)
+    np.testing.assert_allclose(colors.state.outside, expected.state.outside)
+
+
 def test_state_round_trip():
     first, second = PartColors(BODY), PartColors(BODY)
     clothed(first)

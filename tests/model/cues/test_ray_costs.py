@@ -7,6 +7,7 @@ import pytest
 
 from tests.model.figures import BODY, draw_silhouettes
 from tests.model.ring import ring_of_cameras
+from tk.kernels.mask_values import OTHERS
 from tk.kernels.raycast import costs
 from tk.model.body.cone_body import COLOR_GROUPS
 from tk.model.body.gait_poses import walking_pose
@@ -119,6 +120,35 @@ def test_color_of_another_part_costs():
     np.testing.assert_allclose(wrong[0], UNCERTAIN_COST * share, rtol=0.1)
     # no pictures, no colours
     assert Evidence.of(FINE, MASKS, None, images[:0], colors).bins is None
+
+
+def test_doubt_costs_what_neither_the_other_person_nor_the_part_explains():
+    """Each ray against the definition: the other one's mismatch, or that of the part that is hit, whichever is less."""
+    rng = np.random.default_rng(5)
+    label = FINE.render(BODY, POSES[:1]).label[0]
+    images = rng.integers(0, 256, (*label.shape, 3), np.uint8)
+    masks = np.where((label > 0) & (np.arange(120) > 60), OTHERS, MASKS).astype(np.uint8)
+    colors, doubt = PartColors(BODY), rng.random(label.shape, np.float32)
+    bins = Evidence.of(FINE, masks, None, images).bins
+    colors.learn(bins[label > 0], label[label > 0])
+    sure, doubted = (Evidence.of(FINE, masks, None, images, colors, doubt=d) for d in (None, doubt))
+    others = masks == OTHERS
+    assert not sure.rays[others].any() and others.any()
+    np.testing.assert_array_equal(doubted.rays[~others], sure.rays[~others])
+    for ray in np.argwhere(others)[::37]:
+        d, own = doubt[tuple(ray)], colors.mismatch[bins[tuple(ray)]]
+        expected = UNCERTAIN_COST * np.array([d, *(min(d, one) for one in own)], np.float32)
+        np.testing.assert_allclose(doubted.rays[tuple(ray)], expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("rows", [40, 54, 160])
+def test_squares_of_a_finer_grid_are_found_at_the_rays_of_a_coarser_one(rows):
+    fine, coarse = RayGrid(RIG, 80), RayGrid(RIG, rows)
+    height, width = RIG.frame_shape
+    of_pixel = np.arange(height)[:, None] // fine.step * 1000 + np.arange(width) // fine.step
+    cells = np.broadcast_to(of_pixel[:: fine.step, :: fine.step], fine.rays.shape[:3])
+    expected = coarse.sample(np.broadcast_to(of_pixel, (len(RIG), height, width)))
+    np.testing.assert_array_equal(coarse.nearest(fine, cells), expected)
 
 
 NAMES = [part.name for part in BODY.parts]

@@ -22,6 +22,7 @@ from tk.model.body.cone_body import COLOR_GROUPS, ConeBody
 from tk.model.stateful import Stateful
 
 Float = NDArray[np.float64]
+Single = NDArray[np.float32]
 
 # Standard deviation of the smoothing over bins, in bins: gain and white colour differ a little between cameras.
 _SMOOTHING = 0.7
@@ -85,14 +86,16 @@ class PartColors(Stateful[LearnedColors]):
         """Return whether any colours have been learned."""
         return self._counts is not None
 
-    def learn(self, bins: NDArray[np.int32], label: NDArray[np.uint8]) -> None:
-        """Learn the colours (N,) of the mask's pixels; they show the parts ``label - 1`` (N,), or none: 0."""
+    def learn(self, bins: NDArray[np.int32], label: NDArray[np.uint8], weight: Single | None = None) -> None:
+        """Learn the colours (N,) of the mask's pixels; they show the parts ``label - 1`` (N,), or none: 0. ``weight``:
+        (N,) in [0, 1], how far each pixel counts; None: fully."""
         shown = label > 0
         counts = np.zeros((len(COLOR_GROUPS), COLOR_BINS)) if self._counts is None else self._counts
         before = np.zeros(COLOR_BINS) if self._outside is None else self._outside
         flat = self._group[label[shown].astype(np.int64) - 1] * COLOR_BINS + bins[shown]
-        seen = np.bincount(flat, minlength=counts.size).reshape(counts.shape)
-        outside = np.bincount(bins[~shown], minlength=COLOR_BINS)
+        of_shown, of_rest = (None, None) if weight is None else (weight[shown], weight[~shown])
+        seen = np.bincount(flat, of_shown, minlength=counts.size).reshape(counts.shape)
+        outside = np.bincount(bins[~shown], of_rest, minlength=COLOR_BINS)
         rate = RATE if self.known else 1.0
         self._counts = (1 - rate) * counts + rate * seen
         self._outside = (1 - rate) * before + rate * outside
@@ -106,8 +109,7 @@ class PartColors(Stateful[LearnedColors]):
         share = rows / np.maximum(total, 1e-9)
         log_likelihood = np.log(((1 - _ANYTHING) * share + _ANYTHING / COLOR_BINS).astype(np.float32))
         self.log_likelihood = log_likelihood
-        deficit = (log_likelihood.max(axis=0) - log_likelihood[:-1]) / _MOST_LOG_RATIO
-        self.mismatch = np.ascontiguousarray(np.minimum(deficit, 1.0).T)
+        self.mismatch = np.ascontiguousarray(deficit(log_likelihood.max(axis=0), log_likelihood[:-1]).T)
         self.foreign = outside + _ANYTHING * total[-1] / COLOR_BINS > rows[-1]
 
     def regions(self, images: NDArray[np.uint8], size: tuple[int, int]) -> Regions | None:
@@ -131,6 +133,12 @@ class PartColors(Stateful[LearnedColors]):
             self._update()
         else:
             self._forget()
+
+
+def deficit(likelier: Single, log_likelihood: Single) -> Single:
+    """Return in [0, 1] by how much log-likelihoods (...) are below others (...): 0 if they are not, 1 from
+    :data:`_MOST_LOG_RATIO` on."""
+    return np.clip((likelier - log_likelihood) / _MOST_LOG_RATIO, 0.0, 1.0)
 
 
 def color_bins(images: NDArray[np.uint8]) -> NDArray[np.int32]:

@@ -2,8 +2,9 @@
 
 A ray through the mask that hits no part has a mismatch of 1, and so has a ray that hits a part outside the mask; half
 of that where the mask is uncertain. A ray through the mask that hits a part has the mismatch of its colour with that
-part. The mismatch of a pose is the share of the person's rays, mean over the views: without colours E_S of the paper
-(eq. 12).
+part. On another person a ray has none, unless its colour is in doubt there: then it has the mismatch of its colour with
+the other person, or with the part that it hits, whichever is less. The mismatch of a pose is the share of the person's
+rays, mean over the views: without colours E_S of the paper (eq. 12).
 """
 
 from __future__ import annotations
@@ -70,6 +71,14 @@ class RayGrid:
         reduced."""
         return every(images, self.rig.frame_shape, self.step)
 
+    def nearest(self, finer: RayGrid, cells: NDArray) -> NDArray:
+        """Return values (V, h, w) of the squares of a finer grid of the same cameras at the rays of this one."""
+        rows, columns = (
+            np.minimum((self.step // 2 + self.step * np.arange(count)) // finer.step, limit - 1)
+            for count, limit in zip(self.rays.shape[1:3], cells.shape[1:], strict=True)
+        )
+        return cells[:, rows[:, None], columns]
+
     def render(self, body: ConeBody, poses: Float) -> Cast:
         """Return the parts of the body that the rays meet at poses (B, D): labels and depths (B, V, h, w)."""
         free = np.zeros((*self.rays.shape[:3], 2), np.float32)
@@ -83,10 +92,11 @@ class Evidence:
     Attributes:
         grid: rays of the V views.
         person: (V, h, w) bool, the mask.
-        others: (V, h, w) bool, pixels of other people, where a body has no mismatch; None if there are none.
+        others: (V, h, w) bool, pixels of other people, where a body is no missing area; None if there are none.
         rays: (V, h, w, G + 1) float32, mismatch of each ray, see :mod:`tk.kernels.raycast`.
         bins: (V, h, w) bin of each ray's colour; None without colours.
         cues: what else was measured of the person in the frame.
+        doubt: (V, h, w) of the owners of the pixels, see :class:`~tk.trackers.protocol.Frame`; None without doubt.
     """
 
     grid: RayGrid
@@ -95,6 +105,7 @@ class Evidence:
     bins: NDArray[np.int32] | None
     others: NDArray[np.bool_] | None = None
     cues: Sequence[Cue] = ()
+    doubt: NDArray[np.float32] | None = None
 
     @staticmethod
     def of(
@@ -104,9 +115,10 @@ class Evidence:
         images: NDArray[np.uint8] | None = None,
         colors: PartColors | None = None,
         cues: Sequence[Cue] = (),
+        doubt: NDArray[np.float32] | None = None,
     ) -> Evidence:
-        """Return the evidence of masks (V, H, W), uncertain pixels, images, the learned colours of the parts, and
-        other cues."""
+        """Return the evidence of masks (V, H, W), uncertain pixels, images, the learned colours of the parts, other
+        cues, and the doubt (V, h, w) on the grid."""
         sampled = np.ascontiguousarray(grid.sample(masks))
         person, others = sampled >= PERSON, sampled == OTHERS
         outside = np.ones(person.shape, np.float32)
@@ -123,7 +135,11 @@ class Evidence:
             on_person = np.flatnonzero(person)  # several times as fast as a mask as an index
             of_colors = colors.mismatch.take(bins.ravel().take(on_person), axis=0)
             rays.reshape(-1, rays.shape[-1])[on_person, 1:] = UNCERTAIN_COST * of_colors
-        return Evidence(grid, person, rays, bins, others if shared else None, cues)
+            if shared and doubt is not None:
+                of_other, of_colors = doubt[others][:, None], colors.mismatch.take(bins[others], axis=0)
+                rays[others, :1] = UNCERTAIN_COST * of_other
+                rays[others, 1:] = UNCERTAIN_COST * np.minimum(of_other, of_colors)
+        return Evidence(grid, person, rays, bins, others if shared else None, cues, doubt)
 
     def mismatch(
         self,
