@@ -1,12 +1,13 @@
-"""Other poses of the limbs, tracked through a recording beside the present ones, and which of them are likelier.
+"""Other poses of the body and its limbs, tracked through a recording beside the present ones, and which are likeliest.
 
 The first pass may have misplaced an arm, exchanged the legs, or taken the back for the front, for a while. So other
-poses of the body and of its arms are tracked through the whole recording, forwards and backwards. They begin at the
-prediction from the neighbouring frames, or at the exchanged legs. A hidden Markov model with two states, the present
-and the other pose, gives the probability of either in each frame, from the costs in all frames and the changes of the
-joints' velocities (Rabiner, Proc. IEEE, 1989). The pose becomes the likelier one, and σ includes the difference. Other
-poses that the first pass found in its limb searches are tracked in the same manner, from the frames of the searches on,
-and only add to σ: the first pass has compared them with colours.
+poses are tracked through the whole recording, forwards and backwards. They begin at the prediction from the
+neighbouring frames, at the exchanged legs, or at what the limb searches of the first pass have found. A hidden Markov
+model gives their probabilities in each frame, from the costs in all frames and the changes of the joints' velocities
+(Rabiner, Proc. IEEE, 1989). The pose becomes the likeliest one, and σ includes the distances of all others from it.
+
+All poses of the body are the states of one model; then all poses of each limb are. If only the present and one other
+pose were compared at a time, a pose that has been replaced would be lost, although it may continue another one.
 
 Neighbouring frames say nearly the same as long as nobody moves. So only some frames are compared: two neighbouring ones
 of these say together no more than one independent frame (:func:`apart`).
@@ -17,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -83,19 +85,6 @@ class Tracks(NamedTuple):
     found: NDArray[np.bool_]
     cost: Float
 
-    def of(self, rows: slice) -> Tracks:
-        """Return some alternatives."""
-        return Tracks(self.poses[rows], self.found[rows], self.cost[rows])
-
-    def beside(self, other: Tracks) -> Tracks:
-        """Return these alternatives, and in frames in which they are not found those of another direction."""
-        own = self.found
-        return Tracks(
-            np.where(own[..., None], self.poses, other.poses),
-            own | other.found,
-            np.where(own, self.cost, other.cost),
-        )
-
 
 class Choice:
     """The choice between poses in K frames. Poses are in the tracker's own world.
@@ -107,10 +96,10 @@ class Choice:
         follows: (K - 1,) whether the person was tracked in all frames between two neighbouring ones.
         poses: (K, D) the present ones.
         share: (K,) of an independent frame that each says.
-        advance: receives numbers of frames that are done; each counts four times.
+        advance: receives the parts of a comparison that are done; the body is compared, and each limb.
 
     Attributes:
-        poses: (K, D) the likelier ones.
+        poses: (K, D) the likeliest ones.
         variance: (K, J) of the joints' positions along an axis, metres², that the choice leaves open.
     """
 
@@ -122,99 +111,149 @@ class Choice:
         follows: NDArray[np.bool_],
         poses: Float,
         share: Float,
-        advance: Callable[[int], None],
+        advance: Callable[[float], None],
     ) -> None:
         self.tracker, self.poses, self.variance = tracker, poses.copy(), np.zeros((len(poses), len(JOINTS)))
         self._shown, self._frames, self._follows, self._share, self._advance = shown, frames, follows, share, advance
 
     def decide(self, modes: Float | None) -> None:
-        """Track other poses of the limbs in both directions, and replace the present ones where these are likelier;
-        with them those that the first pass left open, ``modes`` (K, 2, D), NaN where it left none."""
-        limbs, every = self.tracker.limbs, np.arange(self.poses.shape[1])
-        arms = [Alternative(limb.dofs, limb) for limb in limbs if limb.name.startswith("arm")]
+        """Track other poses of the body, then of its limbs, in both directions, and take the likeliest ones.
+
+        Args:
+            modes: (K, 2, D) poses of limbs that the first pass left open, NaN where it left none.
+        """
+        limbs, every, first = self.tracker.limbs, np.arange(self.poses.shape[1]), self.poses.copy()
+        arms = [limb for limb in limbs if limb.name.startswith("arm")]
         legs = tuple(limb for limb in limbs if limb.name.startswith("leg"))
         rest = np.setdiff1d(every, np.concatenate([arm.dofs for arm in arms]))
-        rows = [] if modes is None else list(modes.swapaxes(0, 1))
-        left_open = [Alternative(limb.dofs, limb, poses, moves=False) for limb in limbs for poses in rows]
-        done: list[Tracks] = []
-        for step in (1, -1):
-            swapped = np.concatenate([exchanged(poses, [legs])[0] for poses in blocks(self.poses)])
-            others = [Alternative(every), Alternative(rest, begins=swapped), *arms]
-            tracks = self._track([*others, *left_open], step)
-            for k, one in enumerate(others):
-                other, likelier = self._compared(one, *(values[k] for values in tracks))
-                self.poses[likelier] = other[likelier]
-                change = tracks.cost[k, likelier].copy()  # costs are relative to the present pose
-                for known in (*done, tracks):
-                    known.cost[:, likelier] -= change
-            done.append(tracks.of(slice(len(others), None)))
-        for one, poses, found, cost in zip(left_open, *done[0].beside(done[1]), strict=True):
-            self._compared(one, poses, found, cost)
+        swapped = np.concatenate([exchanged(poses, [legs])[0] for poses in blocks(self.poses)])
+        self._choose([Alternative(every), Alternative(rest, begins=swapped)])
+        left_open = [] if modes is None else list(modes.swapaxes(0, 1))
+        for limb in limbs:
+            others = [Alternative(limb.dofs, limb, poses, moves=False) for poses in left_open]
+            others.append(Alternative(limb.dofs, limb, first))  # where another pose of the body is likelier
+            self._choose([*others, Alternative(limb.dofs, limb)] if limb in arms else others)
 
-    def _compared(
-        self, one: Alternative, poses: Float, found: NDArray[np.bool_], cost: Float
-    ) -> tuple[Float, NDArray[np.bool_]]:
-        """Return the present poses (K, D) with an alternative's limbs, where it is found, and whether these are
-        likelier in each frame; add the spread of the two to the variance. Arguments as in :class:`Tracks`."""
-        other = self.poses.copy()
-        other[np.ix_(found, one.dofs)] = poses[np.ix_(found, one.dofs)]
-        joints = self.tracker.body.skeleton.joints(np.array([self.poses, other]))
-        share = second_of_two(np.where(found, cost, 0.0), self._surprises(joints) / CHANGE_M)
-        square = ((joints[1] - joints[0]) ** 2).sum(axis=-1) / 3
-        self.variance += (share * (1.0 - share))[:, None] * square
-        return other, (share > 0.5) & found
+    def _choose(self, alternatives: Sequence[Alternative]) -> None:
+        """Track alternatives in both directions, and replace the present poses by the likeliest ones; add the spread
+        about these to the variance."""
+        skeleton, every, begun = self.tracker.body.skeleton, np.arange(len(self.poses)), self._begun(alternatives)
+        tracks = [self._track(alternatives, begun, step) for step in (1, -1)]
+        states = [(track, k) for track in tracks for k in np.flatnonzero(track.found.any(axis=1))]
+        poses = np.stack([self.poses, *(track.poses[k] for track, k in states)])  # (S, K, D)
+        cost = np.stack([np.zeros(len(every)), *(track.cost[k] for track, k in states)])
+        known = np.stack([np.ones(len(every), np.bool_), *(track.found[k] for track, k in states)])
+        joints = np.stack([skeleton.joints(one) for one in poses])
+        for n in range(1, len(poses)):
+            same = np.linalg.norm(joints[:n] - joints[n], axis=-1).max(axis=-1) <= SAME_POSE_M
+            known[n] &= ~(same & known[:n]).any(axis=0)
+        share = self._shares(joints, known, cost)
+        best = share.argmax(axis=0)
+        square = ((joints - joints[best, every]) ** 2).sum(axis=-1) / 3
+        self.variance += np.einsum("sk,skj->kj", share, square)
+        self.poses = poses[best, every]
 
-    def _surprises(self, joints: Float) -> Float:
-        """Return (K, 2, 2, 2) how far a joint is from its prediction, metres, the joint for which this is most: in each
-        of two states with joints (2, K, J, 3), last axis, predicted from each state of two frames before and of the
-        frame before. Anything may happen in lost frames; after them the velocity is not known."""
-        result = np.zeros((joints.shape[1], 2, 2, 2))
-        steps = joints[None, :, 1:] - joints[:, None, :-1]
-        result[1:] = np.linalg.norm(steps, axis=-1).max(axis=-1).transpose(2, 0, 1)[:, None]
-        known, gap = np.flatnonzero(self._follows[1:] & self._follows[:-1]), np.diff(self._frames)
-        past = (VELOCITY * gap[1:] / gap[:-1])[:, None, None] * steps[:, :, None, :-1]
-        away = steps[None, :, :, 1:] - past
-        result[2 + known] = np.linalg.norm(away[..., known, :, :], axis=-1).max(axis=-1).transpose(3, 0, 1, 2)
-        result[1:][~self._follows] = 0.0
+    def _shares(self, joints: Float, known: NDArray[np.bool_], cost: Float) -> Float:
+        """Return (S, K) the probabilities of S states in each frame.
+
+        Args:
+            joints: (S, K, J, 3).
+            known: (S, K) whether a frame has this state.
+            cost: (S, K) nats.
+        """
+        states = [np.flatnonzero(one) for one in known.T]
+        places = [joints[rows, k] for k, rows in enumerate(states)]
+        costs = [cost[rows, k] for k, rows in enumerate(states)]
+        result = np.zeros(known.shape)
+        for k, (rows, share) in enumerate(zip(states, probabilities(costs, self._surprises(places)), strict=True)):
+            result[rows, k] = share
         return result
 
-    def _track(self, alternatives: Sequence[Alternative], step: int) -> Tracks:
-        """Track alternatives forwards (``step`` 1) or backwards (-1) beside the present poses."""
+    def _surprises(self, joints: Sequence[Float]) -> list[Float]:
+        """Return for K - 1 steps the negative logarithm (P, S, T) of the probability of each state of a frame, last
+        axis, after those of the two frames before; P is 1 where the velocity is not known. Anything may happen in lost
+        frames.
+
+        Args:
+            joints: of K frames, (S, J, 3) for S states.
+        """
+        result, gap, past = [], np.diff(self._frames), None
+        for k, (before, here) in enumerate(pairwise(joints)):
+            step = here - before[:, None]
+            if not self._follows[k]:
+                result.append(np.zeros((1, *step.shape[:2])))
+                past = None
+                continue
+            ahead = 0.0 if past is None else VELOCITY * gap[k] / gap[k - 1] * past[:, :, None]
+            result.append(np.linalg.norm(step - ahead, axis=-1).max(axis=-1).reshape(-1, *step.shape[:2]) / CHANGE_M)
+            past = step
+        return result
+
+    def _begun(self, alternatives: Sequence[Alternative]) -> Tracks:
+        """Return what the poses at which alternatives begin converge to in each frame, those that are not improbable.
+        Costs are not multiplied by the frame's share."""
+        poses = np.repeat(self.poses[None], len(alternatives), axis=0)
+        cost = np.full(poses.shape[:2], np.inf)
+        for k, one in enumerate(alternatives):
+            if one.begins is not None:
+                known = np.flatnonzero(np.isfinite(one.begins[:, one.dofs]).all(axis=1))
+                poses[k][np.ix_(known, one.dofs)] = one.begins[np.ix_(known, one.dofs)]
+        rows = np.flatnonzero((poses != self.poses).any(axis=(0, 2)))
+        for frames in (rows[k : k + AT_ONCE] for k in range(0, len(rows), AT_ONCE)):
+            seen = cache(self._shown)
+            poses[:, frames] = self._settled(alternatives, poses[:, frames], frames, seen)
+            for i in frames.tolist():
+                if len(differ := np.flatnonzero((poses[:, i] != self.poses[i]).any(axis=1))):
+                    cost[differ, i] = self._more(seen(i), i, poses[differ, i])
+        found = cost <= DROPPED
+        return Tracks(np.where(found[..., None], poses, self.poses), found, cost)
+
+    def _more(self, pyramid: Pyramid, i: int, poses: Float) -> Float:
+        """Return (B,) by how much poses (B, D) cost more than the present one in frame i, nats."""
+        cost = self.tracker.cost(pyramid, np.concatenate([self.poses[i][None], poses]))
+        return np.asarray(cost[1:] - cost[0])
+
+    def _track(self, alternatives: Sequence[Alternative], begun: Tracks, step: int) -> Tracks:
+        """Track alternatives forwards (``step`` 1) or backwards (-1) beside the present poses. ``begun``: what they
+        begin as, see :meth:`_begun`."""
         order, result = np.arange(len(self.poses))[::step], np.repeat(self.poses[None], len(alternatives), axis=0)
         found, cost = np.zeros(result.shape[:2], bool), np.zeros(result.shape[:2])
         mean = nothing = np.full(len(alternatives), np.nan)  # of the cost; NaN: none is tracked
         pasts: list[Float | None] = [None] * len(alternatives)  # (D,) their poses in the frame before the last
+        free = [k for k, one in enumerate(alternatives) if one.begins is None]
         for begin in range(0, len(order), AT_ONCE):
             frames, seen = order[begin : begin + AT_ONCE], cache(self._shown)
             # most alternatives become the present pose at once: those that begin are settled together
-            starts = np.stack([self._starts(one, frames, step) for one in alternatives])
-            begun = self._settled(alternatives, starts, frames, seen)
-            self._advance(2 * len(frames))
+            starts = begun.poses[:, frames].copy()
+            if some := [alternatives[k] for k in free]:
+                starts[free] = self._settled(some, self._starts(some, frames, step), frames, seen)
+            self._advance(len(frames) / (2 * len(self.poses)))
             for n, i in enumerate(frames.tolist()):
-                joined, last, present, poses = self._joined(i, step), i - step, self.poses[i], begun[:, n]
+                joined, last, present, poses = self._joined(i, step), i - step, self.poses[i], starts[:, n]
+                if np.isnan(mean).all() and (poses == present).all():
+                    continue
                 anew = [not joined or one.begins_anew(i) for one in alternatives]
                 known, mean = np.where(anew, np.nan, mean), nothing.copy()
                 if tracked := np.flatnonzero(np.isfinite(known)).tolist():
                     some = [alternatives[k] for k in tracked]
-                    starts = np.repeat(present[None, None], len(some), axis=0)
-                    for start, k, one in zip(starts[:, 0], tracked, some, strict=True):
+                    ahead = np.repeat(present[None, None], len(some), axis=0)
+                    for start, k, one in zip(ahead[:, 0], tracked, some, strict=True):
                         start[one.dofs] = self._predicted(i, step, result[k, last], pasts[k])[one.dofs]
-                    poses[tracked] = self._settled(some, starts, frames[n : n + 1], seen)[:, 0]
+                    poses[tracked] = self._settled(some, ahead, frames[n : n + 1], seen)[:, 0]
                 each = zip(alternatives, result, np.isfinite(known).tolist(), strict=True)
                 pasts = [self._past(*one, last) if joined else None for one in each]
-                differ = np.flatnonzero((poses != present).any(axis=1))
-                if not len(differ):
-                    continue
-                pyramid = seen(i)
-                costs = self.tracker.cost(pyramid, np.concatenate([present[None], poses[differ]]))
-                more = costs[1:] - costs[0]
-                mean[differ] = np.where(np.isnan(known[differ]), more, known[differ] + RENEWAL * (more - known[differ]))
+                differ = (poses != present).any(axis=1)
+                more = np.where(np.isnan(known), begun.cost[:, i], np.inf)
+                if len(asked := np.flatnonzero(differ & ~np.isfinite(more))):
+                    more[asked] = self._more(seen(i), i, poses[asked])
+                mean[differ] = np.where(np.isnan(known), more, known + RENEWAL * (more - known))[differ]
                 mean[mean > DROPPED] = np.nan
-                kept = differ[np.isfinite(mean[differ])]
-                # a limb behind other people costs nothing, and only the first pass sees its colours
-                hidden = SHARED * (pyramid.masks[0] == OTHERS).any()
-                result[kept, i], found[kept, i] = poses[kept], True
-                cost[kept, i] = self._share[i] * more[np.isfinite(mean[differ])] + hidden
+                kept = np.flatnonzero(np.isfinite(mean))
+                if len(kept):
+                    # a limb behind other people costs nothing, and only the first pass sees its colours
+                    hidden = SHARED * (seen(i).masks[0] == OTHERS).any()
+                    result[kept, i], found[kept, i] = poses[kept], True
+                    cost[kept, i] = self._share[i] * more[kept] + hidden
         return Tracks(result, found, cost)
 
     def _joined(self, i: int, step: int) -> bool:
@@ -229,20 +268,18 @@ class Choice:
         frame, last, before = self._frames[[i, i - step, i - 2 * step]]
         return np.asarray(pose + VELOCITY * (frame - last) / (last - before) * (pose - past))
 
-    def _starts(self, one: Alternative, frames: NDArray[np.int64], step: int) -> Float:
-        """Return the poses (N, D) from which an alternative begins in N frames; the present one where it does not."""
-        poses = self.poses[frames]
-        if one.begins is not None:
-            angles = one.begins[frames][:, one.dofs]
-            known = np.flatnonzero(np.isfinite(angles).all(axis=1))
-            poses[np.ix_(known, one.dofs)] = angles[known]
-        else:
-            for n, i in enumerate(frames.tolist()):
-                if self._joined(i, step):
-                    last = i - step
-                    past = self.poses[last - step] if self._joined(last, step) else None
-                    poses[n, one.dofs] = self._predicted(i, step, self.poses[last], past)[one.dofs]
-        return poses
+    def _starts(self, alternatives: Sequence[Alternative], frames: NDArray[np.int64], step: int) -> Float:
+        """Return the poses (A, N, D) in N frames that the neighbouring frames predict for the degrees of freedom of
+        each alternative; the present ones after lost frames."""
+        result = np.repeat(self.poses[frames][None], len(alternatives), axis=0)
+        for n, i in enumerate(frames.tolist()):
+            if self._joined(i, step):
+                last = i - step
+                past = self.poses[last - step] if self._joined(last, step) else None
+                predicted = self._predicted(i, step, self.poses[last], past)
+                for poses, one in zip(result, alternatives, strict=True):
+                    poses[n, one.dofs] = predicted[one.dofs]
+        return result
 
     def _past(self, one: Alternative, poses: Float, tracked: bool, frame: int) -> Float | None:
         """Return the pose (D,) in a frame of an alternative with poses (K, D), which was tracked there or begins in the
@@ -296,24 +333,22 @@ def apart(frames: NDArray[np.int64], share: Float, needed: NDArray[np.bool_]) ->
     return np.array(chosen, np.int64)
 
 
-def second_of_two(cost: Float, steps: Float) -> Float:
-    """Return (F,) the probability of the second of two states in each of F frames, by the forward-backward algorithm
-    for pairs of states.
+def probabilities(costs: Sequence[Float], steps: Sequence[Float]) -> list[Float]:
+    """Return (S,) the probabilities of the states of each of F frames, by the forward-backward algorithm for pairs of
+    states. Their number S may differ from frame to frame.
 
     Args:
-        cost: (F,) negative logarithm of the second state's likelihood relative to the first's.
-        steps: (F, 2, 2, 2) negative logarithm of the probability of a frame's state, last axis, after those two frames
-            and one frame before it.
+        costs: F arrays (S,), negative logarithm of the states' likelihoods, up to a constant of the frame.
+        steps: F - 1 arrays (P, S, T), negative logarithm of the probability of a frame's state, last axis, after those
+            of the two frames before it; P may be 1.
     """
-    frame = np.stack([np.zeros_like(cost), cost], axis=1)
-    forward = np.zeros((len(cost), 2, 2))  # of the states of the frame before, and of the frame
-    backward = np.zeros_like(forward)
-    forward[0] = frame[0]
-    for k in range(1, len(cost)):
-        before = forward[k - 1, :, :, None] + steps[k]
-        forward[k] = frame[k] - np.logaddexp(-before[0], -before[1])
-    for k in range(len(cost) - 1, 0, -1):
-        after = steps[k] + frame[k] + backward[k]
-        backward[k - 1] = -np.logaddexp(-after[..., 0], -after[..., 1])
-    first, second = -np.logaddexp.reduce(-(forward + backward), axis=1).T
-    return np.asarray(1.0 / (1.0 + np.exp(np.clip(second - first, -500.0, 500.0))))
+    forward = [costs[0][None]]  # of the states of the frame before, and of the frame
+    for cost, step in zip(costs[1:], steps, strict=True):
+        forward.append(cost - np.logaddexp.reduce(-(forward[-1][:, :, None] + step), axis=0))
+    backward, result = np.zeros_like(forward[-1]), []
+    for k in range(len(costs) - 1, -1, -1):
+        share = np.logaddexp.reduce(-(forward[k] + backward), axis=0)
+        result.append(np.exp(share - np.logaddexp.reduce(share)))
+        if k:
+            backward = -np.logaddexp.reduce(-(steps[k - 1] + costs[k] + backward), axis=2)
+    return result[::-1]

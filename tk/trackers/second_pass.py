@@ -89,12 +89,12 @@ class SecondPass:
         steps, seen = _steps(tracker.body.skeleton.joints(poses[self.tracked])), len(self.tracked)
         self._share[self.tracked] = np.clip(steps / CORRELATED_M, 1.0 / min(tracker.fps * STILL_S, seen), 1.0)
         self.poses, self.residual = poses.copy(), np.array(residual)
-        self._variance = np.zeros((2, len(poses), len(JOINTS)))  # of the pose, and of the choice between two
+        self._variance = np.zeros((2, len(poses), len(JOINTS)))  # of the pose, and of the choice
         # in a recording they are constant offsets, which sigma leaves out; few frames do not tell them from errors
         self._few = seen <= FIT_FRAMES
         self._constant = np.full(len(JOINTS), SEGMENT_M**2 if self._few else 0.0)
         self._view_m = float(np.hypot(tracker.view_m, CONSTANT_M)) if self._few else tracker.view_m
-        self._done = 0
+        self._done = 0.0
 
     @property
     def sigma(self) -> Float:
@@ -185,8 +185,8 @@ class SecondPass:
         return residual_of(label > 0, sampled >= PERSON, sampled == OTHERS)
 
     def decide(self) -> None:
-        """Replace the poses of limbs where others, which are tracked beside them, are likelier; add what stays open to
-        the variance. Frames between those of the comparison take part in the nearest one's change."""
+        """Replace poses where others, which are tracked beside them, are likelier; add what stays open to the variance.
+        Frames between those of the comparison take part in the nearest one's change."""
         tracked, share = self.tracked, self._share[self.tracked]
         modes = None if self._modes is None else self._modes[tracked]
         needed = np.zeros(len(tracked), np.bool_) if modes is None else np.asarray(np.isfinite(modes).any(axis=(1, 2)))
@@ -199,7 +199,7 @@ class SecondPass:
             np.diff(rows) == np.diff(frames),
             self.poses[frames],
             np.minimum(said, 1.0),
-            lambda done: self._advance(done * len(tracked) // len(frames)),
+            lambda part: self._advance(4 * len(tracked) * part / (1 + len(self.tracker.limbs))),
         )
         choice.decide(None if modes is None else modes[rows])
         change = choice.poses - self.poses[frames]
@@ -219,9 +219,9 @@ class SecondPass:
         for k in np.flatnonzero(self.tracker.body.skeleton.is_by_landmarks) if len(seen) else ():
             self.poses[self.tracked, k] = np.interp(self.tracked, seen, self.poses[seen, k])
 
-    def _advance(self, frames: int) -> None:
-        """Report the share that is done: every frame is settled once, tracked in both directions, which takes as long
-        as four rounds, and smoothed in all rounds."""
+    def _advance(self, frames: float) -> None:
+        """Report the share that is done: every frame is settled once, compared with others, which takes as long as four
+        rounds, and smoothed in all rounds."""
         self._done += frames
         self._report(min(self._done / ((5 + ROUNDS) * len(self.tracked)), 1.0))
 
