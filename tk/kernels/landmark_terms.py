@@ -12,14 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.kinematics import (
-    JOINT_NUMBERS,
-    TWIST,
-    forward_tree,
-    load_rotation,
-    load_translation,
-    parent_of,
-)
+from tk.kernels.kinematics import JOINT_NUMBERS, TWIST, forward_tree, load_rotation, load_translation, parent_of
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.taichi_internals import Launcher
 from tk.kernels.vectors import cross, dot, times, triple, triple_in

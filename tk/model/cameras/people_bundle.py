@@ -63,8 +63,8 @@ class PeopleBundle:
         return tuple(bundle.start for bundle in self.bundles)
 
     def begun_at(self, states: States, late: NDArray[np.int64]) -> States:
-        """Return the given poses, with the cameras and bodies of estimates from other frames; a camera's frames are
-        ``late`` (C,) frames later here."""
+        """Return the given poses, with the cameras and bodies of estimates from other images. Delays of ``late`` (C,)
+        whole frames, which those had, have been removed from the images here."""
         moved = np.zeros((len(self.sigma), len(self.rig)))
         if "offset" in self.parameters:  # it comes last
             moved[-1] = late

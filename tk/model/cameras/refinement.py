@@ -94,7 +94,7 @@ def refine_cameras(
         rig: the cameras as calibrated.
         config: see :class:`RefinementSettings`.
         begun: a result of the same people, whose cameras and bodies are the first estimate; None: the given ones.
-        late: (C,) by how many frames more than for ``begun`` the cameras' images have been chosen later.
+        late: (C,) delays, whole frames, that the choice of the images has removed since ``begun``.
     """
     config = config or RefinementSettings()
     sigmas = {"turn": np.radians(TURN_DEG) * config.trust, "move": MOVE_M * config.trust}
