@@ -72,7 +72,7 @@ def pieces(path: str, masks: str) -> None:
         done("tracker, without its kernels")
         frames = plan.observations.frames(plan.first, plan.stop)
         with mock.patch.object(kernel, "materialize", timed("transformation of kernels", kernel.materialize)):
-            plan.tracker.prepare(bool(sources_of_masks(task.source)))
+            plan.tracker.prepare(with_landmarks=bool(sources_of_masks(task.source)))
         transformed = spent["transformation of kernels"]
         begun += transformed
         done("kernels from the cache")

@@ -22,7 +22,7 @@ Float = NDArray[np.float64]
 # Columns of ``numbers``: density of a wrong landmark (1/m²) or depth (1/m), probability that left and right of a half
 # are exchanged in an image, logarithms of the probabilities that an image shows the person and somebody else, factor of
 # the precisions, share of the likelihood that counts, least depth, metres, and 2π in full precision.
-_NUMBERS = WRONG, EXCHANGED, SHOWN, ELSEWHERE, PRECISION, INDEPENDENT, NEAREST, TURN = tuple(range(8))
+WRONG, EXCHANGED, SHOWN, ELSEWHERE, PRECISION, INDEPENDENT, NEAREST, TURN = range(8)
 # Columns of ``cameras`` after the 3×4 transform: direction to the person. Of ``points`` after the place: the last
 # degree of freedom above it. Of ``bones``: the landmarks at both ends, and the share of the depth that is seen.
 _SIGHT, _DOF, _FROM, _TO, _SHARE = 12, 3, 0, 1, 2

@@ -130,7 +130,7 @@ class Loop:
         count = self._opening_frames()
         observations = plan.observations.frames(plan.first, None if plan.stop is None else plan.stop + count)
         _LOG.info("reading the first frames and learning what the scene looks like")
-        plan.tracker.prepare(bool(sources_of_masks(plan.task.source)))
+        plan.tracker.prepare(with_landmarks=bool(sources_of_masks(plan.task.source)))
         yield from self._step_through(self._started(observations, count))
         if not self.people.written:
             raise CaptureError(f"{plan.task.source.where}: nobody could be tracked: {self.people.refusal}")

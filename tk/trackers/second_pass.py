@@ -128,8 +128,8 @@ class SecondPass:
             self._advance(len(frames))
 
     def follow(self) -> None:
-        """Optimise every frame by itself from its pose of the first pass, which other cameras have given; give each its
-        residual."""
+        """Optimise every frame by itself, at the scale :data:`LEVEL`, from its pose of the first pass, which other
+        cameras have given; give each its residual. :meth:`settle` optimises at the finest scale."""
         for frames in _chunks(self.tracked):
             coarse = Pyramid.of_all([self._pyramid(i, LEVEL + 1) for i in frames], LEVEL)
             self.poses[frames] = self.tracker.settle(coarse, self.poses[frames], (LEVEL,)).states

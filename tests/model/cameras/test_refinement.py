@@ -229,6 +229,18 @@ def test_delays_of_videos_are_estimated(late):
     assert (done.offset_sigma_frames < 0.2).all()
 
 
+def test_a_refinement_that_begins_at_another_finds_the_same_cameras():
+    """The first one has found a video that is late by a frame; the second one has its other frames."""
+    store, late = rendered((0, 0, 1, 0)), np.array([0, 0, 1, 0])
+    first = refine_cameras([(BODY, frames(store, RIG))], RIG, QUICK)
+    moved = choose_frames(store.get, Views(RIG), BODY.skeleton, tracked(), FRAMES, SCALES, True, late)
+    fresh, again = (refine_cameras([(BODY, moved)], RIG, QUICK, *begun) for begun in ((), (first, late)))
+    np.testing.assert_allclose(again.offset_frames, fresh.offset_frames, atol=0.02)
+    assert max(turn_between(a, b) for a, b in zip(again.rig, fresh.rig, strict=True)) < 0.01
+    assert np.abs(again.rig.centers - fresh.rig.centers).max() < 0.001
+    np.testing.assert_array_equal(again.before_px, fresh.before_px)
+
+
 def test_too_few_usable_frames_give_none():
     assert refine_rig([TrackedPerson(BODY, in_time().get, tracked(usable=slice(3, 8)))], RIG, QUICK) is None
 

@@ -174,6 +174,9 @@ def test_landmarks_of_several_frames_are_compared_with_their_own_poses() -> None
         np.testing.assert_allclose(both.cost(poses)[k], alone.cost(pose[None])[0])
         for one, other in zip(both.normal(poses), alone.normal(pose[None]), strict=True):
             np.testing.assert_allclose(one[k], other[0], rtol=1e-9, atol=1e-6)
+        raised = poses + 0.5 * (np.arange(poses.shape[1]) == NAMES.index("elbow_l_flexion"))
+        assert both.variance(raised)[k].any()
+        np.testing.assert_allclose(both.variance(raised)[k], alone.variance(raised[k][None])[0], rtol=1e-9)
 
 
 def test_unknown_landmarks_say_nothing() -> None:

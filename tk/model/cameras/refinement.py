@@ -77,7 +77,8 @@ class Refined:
     after_px: Float
     converged: bool  # whether the last steps were small
     frame_count: int  # number of frames used
-    states: States  # the estimate of each person
+    present: tuple[bool, ...]  # which of the people have frames
+    states: States  # the estimate of each of these
 
 
 def refine_cameras(
@@ -93,18 +94,19 @@ def refine_cameras(
         people: the bodies, in a world in which z is up, with frames whose pyramids have :data:`SCALES` scales.
         rig: the cameras as calibrated.
         config: see :class:`RefinementSettings`.
-        begun: a result of the same people, whose cameras and bodies are the first estimate; None: the given ones.
+        begun: a result of the same bodies, whose cameras and bodies are the first estimate; None: the given ones.
         late: (C,) delays, whole frames, that the choice of the images has removed since ``begun``.
     """
     config = config or RefinementSettings()
     sigmas = {"turn": np.radians(TURN_DEG) * config.trust, "move": MOVE_M * config.trust}
     sigmas |= ({"focal": FOCAL} if config.focal else {}) | ({"offset": OFFSET_FRAMES} if config.offsets else {})
+    present = tuple(bool(frames) for _, frames in people)
     people = [(body, frames) for body, frames in people if frames]
     bundle = PeopleBundle(people, SCALE_DEVIATION, rig, CAMERA_SEARCH, sigmas)
     C, sigma = len(rig), np.tile(bundle.sigma, len(rig))
     others = np.full(bundle.size - len(sigma), np.inf)
     start, coarse = bundle.start, COARSE_ROUNDS
-    if begun is not None and late is not None and len(begun.states) == len(start):
+    if begun is not None and late is not None and begun.present == present:
         start, coarse = bundle.begun_at(begun.states, late), 0
     solution = minimise(
         start,
@@ -135,6 +137,7 @@ def refine_cameras(
         after_px=residual_px(bundle.contours(final, 0), C) * rig.reductions,
         converged=solution.converged,
         frame_count=sum(len(frames) for _, frames in people),
+        present=present,
         states=final,
     )
 
