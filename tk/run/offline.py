@@ -27,7 +27,7 @@ from tk.run.delays import COMPARED, TrackedPerson, retimed, retimed_measured
 from tk.run.draft import Draft, held, without_absent
 from tk.run.prefetch import open_observations
 from tk.run.refinement import compare_cameras, refine_if_inconsistent
-from tk.run.second_run import Run, explains_better, track_again
+from tk.run.second_run import Run, explains_better, track_again, track_back
 from tk.run.task import Task
 from tk.trackers.hypotheses import DROPPED
 from tk.trackers.judgement import FrameEvidence, FrameJudge, depth_known, judge_frames
@@ -169,6 +169,7 @@ class _Finisher:
                 draft.tracker = self._with_true_heading(draft)
         self._refine_cameras(drafts)
         for draft in drafts:
+            self._find_lost(draft)
             (tracker, masks), subject = draft.tracker_and_masks, draft.person.subject
             _LOG.info("second pass")
             poses, residual, precise = tracker.second_pass(
@@ -243,6 +244,16 @@ class _Finisher:
         self.note("the person faces the other way than the first frames seemed to show: tracked again")
         return opposite
 
+    def _find_lost(self, draft: Draft) -> None:
+        """Find the person in lost frames from the frames after them."""
+        frames, settings = draft.result.frames, self.task.settings.region
+        present = np.flatnonzero(draft.result.status != Status.ABSENT)
+        run = Run.of(draft.tracker_and_masks, frames, draft, present)
+        found = track_back(run, self._landmarks(draft, self.late), self.task.setup.fps, settings.false_alarm)
+        if found:
+            rows = np.flatnonzero(np.isin(frames, list(found)))
+            draft.take(rows, [found[int(frame)] for frame in frames[rows]])
+
     def _tracked_by(self, tracker: TwoPassTracker, draft: Draft, unused: NDArray[np.bool_]) -> Draft:
         """Track the frames of a draft by a tracker that has been started, without the cameras (F, C) that are unused;
         return the draft of it."""
@@ -315,6 +326,11 @@ class _Finisher:
         found = self.task.setup.rig.reduced_pixels(np.concatenate([found, depth[..., None]], axis=-1))
         return {landmarks.NAME: retimed_measured(found, draft.result.frames, late)}
 
+    def _landmarks(self, draft: Draft, late: NDArray[np.int64]) -> dict[int, Float]:
+        """Return the landmarks (C, L, 4) of :meth:`_measured`, by frame, of frames that have any."""
+        seen = self._measured(draft, late).get(landmarks.NAME, ())
+        return {n: own for n, own in zip(draft.result.frames.tolist(), seen, strict=False) if np.isfinite(own).any()}
+
     def _with_cameras(self, draft: Draft, rig: Rig, late: NDArray[np.int64]) -> tuple[Draft, list[str]] | None:
         """Return a draft with other cameras, and without delays, (C,) frames, and lines for the user; None if the first
         pass explains the images better.
@@ -340,8 +356,7 @@ class _Finisher:
             if explains_better(Run.of(now, result.frames, moved, present), first):
                 return moved, []
         _LOG.info("tracking again with the refined cameras")
-        seen = measured.get(landmarks.NAME, ())
-        marked = {n: own for n, own in zip(result.frames.tolist(), seen, strict=False) if np.isfinite(own).any()}
+        marked = self._landmarks(draft, late)
         done = track_again(first, now, source, task.setup, draft.person.subject, marked, self.within)
         if done is None:
             return None

@@ -1,14 +1,18 @@
-"""Track a person a second time, with other cameras, and compare both runs by the same images.
+"""Track a person a second time.
 
-A camera that was left out is judged again, because cameras and delays have changed. The second run counts only if its
-poses explain the images better: every image of both runs is compared, also those of cameras that were left out.
+With other cameras, the whole run: a camera that was left out is judged again, because cameras and delays have changed.
+The second run counts only if its poses explain the images better: every image of both runs is compared, also those of
+cameras that were left out.
+
+Backwards, the frames that were lost: where a search from the frame before has failed, the pose of the frame after may
+lead to the right one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from itertools import chain, islice
+from itertools import chain, islice, takewhile
 from typing import Any, Protocol
 
 import numpy as np
@@ -23,7 +27,10 @@ from tk.model.setup import InitPose, Setup, Subject
 from tk.run.delays import COMPARED
 from tk.trackers.camera_monitor import CameraMonitor
 from tk.trackers.contour_finder import COARSE_ROWS
-from tk.trackers.protocol import Estimate, Frame, TwoPassTracker, shows_person
+from tk.trackers.judgement import FrameJudge
+from tk.trackers.protocol import Estimate, Frame, TwoPassTracker, shows_person, without_cameras
+from tk.trackers.reason import is_lost
+from tk.trackers.residual import RECENT
 
 Float = NDArray[np.float64]
 
@@ -168,3 +175,41 @@ def track_again(
             found[frame.index] = replace(monitor.step(frame)[0], masks=None, drawn=None)  # these are large
             within((frame.index + 1 - begin) / (stop - begin))
     return found, monitor
+
+
+def track_back(run: Run, landmarks: Mapping[int, Float], fps: float, false_alarm: float) -> dict[int, Estimate]:
+    """Track each stretch of lost frames backwards, from the frames after it on, to the first frame in which the person
+    is not found; return the estimates of those in which the person is found, by frame.
+
+    Frames are judged as in the run. The tracker begins :data:`~tk.trackers.residual.RECENT` frames after the stretch,
+    or fewer if those are lost, so that motion and residual are known. Colours are not used: no image is read again.
+
+    Args:
+        run: the run; its frames are in order.
+        landmarks: (C, L, 4) of the person by frame, where there are any.
+        fps: frames per second.
+        false_alarm: as for :func:`~tk.trackers.judgement.judge_frames`.
+    """
+    found: dict[int, Estimate] = {}
+    lost, steps = run.lost, np.diff(run.frames)
+    step = int(np.median(steps)) if len(steps) else 1
+    for rows in np.split(np.arange(len(lost)), np.flatnonzero(steps > step) + 1):
+        for last in np.flatnonzero(lost[rows[:-1]] & ~lost[rows[1:]]):
+            after = list(takewhile(lambda row: not lost[row], rows[last + 1 : last + 1 + RECENT]))
+            stretch = list(takewhile(lambda row: lost[row], rows[last::-1]))
+            tracker = run.tracker.with_cameras(run.tracker.world.rig_out(run.tracker.world.rig))
+            tracker.start_at(run.poses[after[-1]])
+            judge = FrameJudge(tracker, run.residual.shape[1], fps, false_alarm)
+            for row in chain(reversed(after), stretch):
+                if (number := int(run.frames[row])) not in run.masks:
+                    break
+                masks, marked = run.masks.get(number), landmarks.get(number)
+                blank = np.empty((len(masks), 0, 0, 3), np.uint8)
+                frame = Frame(number, blank, masks, landmarks=None if marked is None else marked[None])
+                unused = np.isnan(run.residual[after[0] if lost[row] else row, :, 0])
+                estimate = judge.judge(number, tracker.step(without_cameras(frame, unused)))
+                if is_lost(estimate.reason):
+                    break
+                if lost[row]:
+                    found[number] = replace(estimate, masks=None, drawn=None)  # these are large
+    return found

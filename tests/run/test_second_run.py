@@ -1,0 +1,52 @@
+"""Lost frames are tracked backwards from the frames after them: silhouettes drawn from the tracker's own body."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.model.figures import draw_silhouettes
+from tests.model.ring import ring_of_cameras
+from tests.trackers.walker import BODY, NAMES, STATURE, errors, observe, walk
+from tk.io.captures.mask_store import MaskStore
+from tk.model.setup import InitPose, Subject
+from tk.run.second_run import Run, track_back
+from tk.settings import SilhouetteSettings
+from tk.trackers.protocol import Estimate
+from tk.trackers.region import RegionTracker
+
+RIG = ring_of_cameras(3, width=160, height=200)
+POSES = walk(7)
+MASKS = draw_silhouettes(BODY, RIG, POSES)
+NOBODY = np.zeros_like(MASKS[0])
+CLOSE_M = 0.03
+
+
+def tracked_back(lost: list[int], frames: np.ndarray, nobody_in: int | None = None) -> dict[int, Estimate]:
+    """What is found in the lost rows of a run; it has these frames' masks, and nowhere a pose in a lost one."""
+    tracker, store = RegionTracker(RIG, "z", SilhouetteSettings(adapt=False)), MaskStore()
+    init = InitPose({}, dict(zip(NAMES, POSES[0], strict=True)), None, STATURE)
+    tracker.start([observe(MASKS[0])], Subject(init=init, body=BODY))
+    for row, (number, masks) in enumerate(zip(frames.tolist(), MASKS, strict=True)):
+        store.put(number, NOBODY if row == nobody_in else masks)
+    is_lost = np.isin(np.arange(len(POSES)), lost)
+    poses = np.where(is_lost[:, None], np.nan, POSES)
+    residual = np.where(is_lost[:, None, None], np.nan, np.full((len(POSES), 3, 2), 0.02))
+    return track_back(Run(tracker, store, frames, poses, is_lost, residual), {}, 30.0, 1e-3)
+
+
+@pytest.mark.parametrize("lost", [[0], [2, 3], [0, 1, 3]])
+def test_the_person_is_found_from_the_frames_after_a_stretch(lost: list[int]) -> None:
+    found = tracked_back(lost, np.arange(10, 24, 2))
+    assert sorted(found) == [10 + 2 * row for row in lost]
+    for number, estimate in found.items():
+        assert errors(estimate, POSES[(number - 10) // 2]).mean() < CLOSE_M
+        assert estimate.status == "tracked"
+
+
+def test_frames_before_one_without_anybody_stay_lost() -> None:
+    assert sorted(tracked_back([1, 2, 3, 4], np.arange(7), nobody_in=2)) == [3, 4]
+
+
+def test_no_frame_is_tracked_over_a_gap_or_after_the_end() -> None:
+    assert not tracked_back([2, 6], np.array([0, 1, 2, 9, 10, 11, 12]))
