@@ -482,6 +482,28 @@ def test_modes_as_likely_as_the_pose_add_to_sigma_and_change_no_pose(frames: int
     assert (sigma > 0.08).all() and (before < 0.06).all()
 
 
+@pytest.mark.parametrize("place", ["hanging", "raised"])
+def test_colors_choose_between_poses_that_the_masks_show_alike(place: str) -> None:
+    """The masks show an arm at both of its places in all frames; one of the places has the colours of the trunk."""
+    both = {"hanging": POSES[0], "raised": with_arm(POSES[0], "l", (0.1, 1.0, 0.3), 15.0)}
+    half = draw_silhouettes(BODY, RIG, np.array(list(both.values()))).max(axis=0)
+    tracker, wrist = tracker_at(POSES[0]), JOINTS.index("wrist_l")
+    arm = next(limb for limb in tracker.limbs if "wrist_l" in [JOINTS[k] for k in limb.joints])
+    modes = np.full((3, limbs.KEPT, len(POSES[0])), np.nan)
+    modes[:, 0, arm.dofs] = both["raised"][arm.dofs]
+    label = tracker.coarse_grid.render(tracker.body, tracker.world.poses_in(both[place][None])).label[0]
+    group = np.append(COLOR_GROUPS.index("torso"), BODY.color_group)[label]  # of label 0: the trunk
+    colors = (100 + 400 * group).astype(np.uint16)  # bins that lie apart
+    tracker.colors.learn(colors[label > 0].astype(np.int32), label[label > 0])
+    masks, lost = np.stack(3 * [half]), np.zeros(3, bool)
+    poses, _, sigma = tracker.second_pass(
+        masks, np.repeat(POSES[:1], 3, axis=0), lost, np.zeros((3, 3, 2)), None, modes=modes, colors=3 * [colors],
+        keep_body=True,
+    )  # fmt: skip
+    off = np.linalg.norm(SKELETON.joints(poses) - SKELETON.joints(both[place]), axis=-1)[:, wrist]
+    assert off.max() < 0.06 and sigma[:, wrist].max() < 0.06
+
+
 def test_a_mode_that_one_frame_leaves_open_replaces_the_pose_where_it_is_likelier() -> None:
     """The first pass has the arm at a wrong place in all frames, and has found the right one in the first frame."""
     raised = np.array([with_arm(pose, "l", (0.1, 1.0, 0.3), 15.0) for pose in POSES])

@@ -198,7 +198,7 @@ def exchanged_masks(
             if contact.moment <= frame <= contact.last and frame in masks[a] and frame in masks[b]:
                 owner[a], owner[b] = owner[b], owner[a]
         if frame in masks[owner[person]]:
-            result.put(frame, masks[owner[person]].get(frame))
+            result.put(frame, masks[owner[person]].get(frame), masks[owner[person]].colors(frame))
     return result
 
 

@@ -100,14 +100,17 @@ def _best_delays(shares: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArra
 
 
 def retimed(store: MaskStore, frames: NDArray[np.int64], late: NDArray[np.int64]) -> MaskStore:
-    """Return the masks of frames (F,) of cameras that are late by whole frames (C,); empty if a camera has no image."""
+    """Return the masks of frames (F,), and what they show, of cameras that are late by whole frames (C,); empty if a
+    camera has no image."""
     if not late.any():
         return store
-    result, stored = MaskStore(), lru_cache(16)(store.get)
+    result, stored, colors = MaskStore(), lru_cache(16)(store.get), lru_cache(16)(store.colors)
     for frame in frames.tolist():
+        shown = [(frame - n, c) for c, n in enumerate(late.tolist())]
         none = np.zeros_like(stored(frame)[0])
-        layers = [stored(frame - n)[c] if frame - n in store else none for c, n in enumerate(late.tolist())]
-        result.put(frame, np.stack(layers))
+        layers = np.stack([stored(n)[c] if n in store else none for n, c in shown])
+        known = [one[c] for n, c in shown if (one := colors(n)) is not None]
+        result.put(frame, layers, np.stack(known) if len(known) == len(shown) else None)
     return result
 
 

@@ -261,26 +261,27 @@ class Loop:
         for number, answer in answers.items():
             estimate = answer.estimate
             if self.masks is not None:
-                self.masks[number].put(observation.index, self._kept(answer))
-            # masks are large, and a view into the ring of frames: an estimate must not keep them
-            whole = replace(estimate, frame=observation.index, time=observation.time, person=number)
-            whole = replace(whole, masks=None, drawn=None, mask_source=observation.sources)
+                self.masks[number].put(observation.index, *self._kept(answer))
+            whole = replace(estimate.light, frame=observation.index, time=observation.time, person=number)
+            whole = replace(whole, mask_source=observation.sources)
             if whole.landmarks is not None:
                 seen = self.plan.task.setup.rig.recorded_pixels(whole.landmarks)
                 whole = replace(whole, landmarks=seen)
             found.append(whole)
         return tuple(found)
 
-    def _kept(self, answer: Answer) -> NDArray[np.uint8]:
-        """Return the cleaned masks (C, H, W) of a frame, also of cameras that disagree: they may be refined."""
-        tracker = two_pass(self.plan.tracker)
+    def _kept(self, answer: Answer) -> tuple[NDArray[np.uint8], NDArray[np.uint16] | None]:
+        """Return the cleaned masks (C, H, W) of a frame, also of cameras that disagree: they may be refined; and what
+        the masks show, (C, h, w), if it is known in all cameras."""
+        tracker, estimate = two_pass(self.plan.tracker), answer.estimate
         assert tracker is not None
-        taken = tracker.cleaned(answer.used.masks) if answer.estimate.masks is None else answer.estimate.masks
+        taken = tracker.cleaned(answer.used.masks) if estimate.masks is None else estimate.masks
         out = shows_person(answer.share.masks) & ~shows_person(answer.used.masks)
-        if out.any():
-            taken = taken.copy()
-            taken[out] = tracker.cleaned(answer.share.masks[out])
-        return taken
+        if not out.any():
+            return taken, estimate.colors
+        taken = taken.copy()
+        taken[out] = tracker.cleaned(answer.share.masks[out])
+        return taken, None
 
     def _state(self, output: Output) -> Mapping[str, Value]:
         origin = {_ORIGIN + name: value for name, value in output.origin.items()}

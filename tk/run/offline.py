@@ -152,9 +152,9 @@ class _Finisher:
             )
             return False
         if missing:
-            with open_observations(self.task, lambda _: None) as observations:
+            with open_observations(self.task, lambda _: None, tracker.image_step) as observations:
                 for observation, _ in observations.frames(min(missing), max(missing) + 1):
-                    masks.put(observation.index, tracker.cleaned(tracker.without_foreign(observation).masks))
+                    masks.put(observation.index, *tracker.kept(observation))
         return True
 
     def second_pass(self, drafts: Sequence[Draft]) -> None:
@@ -180,6 +180,7 @@ class _Finisher:
                 subject.height_m,
                 self._measured(draft, self.late),
                 draft.current("evidence/modes"),
+                masks.color_sequence(draft.result.frames),
                 keep_body=subject.body is not None,
                 report=self.within,
             )
@@ -263,12 +264,11 @@ class _Finisher:
             tracker, len(self.task.setup.rig), self.task.setup.fps, self.task.settings.region.false_alarm
         )
         found: list[Estimate] = []
-        with open_observations(self.task, lambda _: None) as observations:
+        with open_observations(self.task, lambda _: None, tracker.image_step) as observations:
             for frame, _ in observations.frames(min(rows), max(rows) + 1):
                 if frame.index in rows:
                     estimate = tracker.step(without_cameras(frame, unused[rows[frame.index]]))
-                    # masks are large
-                    found.append(replace(judge.judge(frame.index, estimate), masks=None, drawn=None))
+                    found.append(judge.judge(frame.index, estimate).light)
                     self.within(len(found) / len(rows))
         again = draft.copy()
         again.take(present, found)

@@ -172,7 +172,7 @@ def track_again(
         opening.reverse()
         waiting = (opening.pop() for _ in range(len(opening)))  # images are large
         for frame in chain(waiting, frames):
-            found[frame.index] = replace(monitor.step(frame)[0], masks=None, drawn=None)  # these are large
+            found[frame.index] = monitor.step(frame)[0].light
             within((frame.index + 1 - begin) / (stop - begin))
     return found, monitor
 
@@ -211,5 +211,5 @@ def track_back(run: Run, landmarks: Mapping[int, Float], fps: float, false_alarm
                 if is_lost(estimate.reason):
                     break
                 if lost[row]:
-                    found[number] = replace(estimate, masks=None, drawn=None)  # these are large
+                    found[number] = estimate.light
     return found

@@ -17,16 +17,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.mask_values import OTHERS
 from tk.model.body.limb_candidates import Limb, exchanged
 from tk.model.body.skeleton import JOINTS, blocks
+from tk.model.cues.ray_costs import Evidence
 from tk.model.masks.silhouettes import Pyramid
 from tk.trackers.hypotheses import DROPPED, RENEWAL, SAME_POSE_M
 
@@ -44,10 +44,8 @@ LEVEL = 1
 APART = 0.5
 # People keep their velocity: VELOCITY times a step predicts the next one best (docs/experiments.md, Second pass; the
 # first pass, whose poses are less exact, predicts less), and the negative logarithm of a step's probability is the
-# distance to this prediction, of the joint that is farthest from it, divided by CHANGE_M. In frames with pixels of
-# other people another pose costs SHARED nats more, because the masks do not show the colours by which the first pass
-# has chosen.
-VELOCITY, CHANGE_M, SHARED = 0.8, SAME_POSE_M, 1.0
+# distance to this prediction, of the joint that is farthest from it, divided by CHANGE_M.
+VELOCITY, CHANGE_M = 0.8, SAME_POSE_M
 
 
 @dataclass(frozen=True)
@@ -91,7 +89,7 @@ class Choice:
 
     Args:
         tracker: with the person's body.
-        shown: two scales of what a frame shows, by its place among the K.
+        shown, evidence: two scales of what a frame shows, and its costs, by its place among the K.
         frames: (K,) their numbers, ascending.
         follows: (K - 1,) whether the person was tracked in all frames between two neighbouring ones.
         poses: (K, D) the present ones.
@@ -107,6 +105,7 @@ class Choice:
         self,
         tracker: RegionTracker,
         shown: Callable[[int], Pyramid],
+        evidence: Callable[[int], Evidence],
         frames: NDArray[np.int64],
         follows: NDArray[np.bool_],
         poses: Float,
@@ -114,6 +113,7 @@ class Choice:
         advance: Callable[[float], None],
     ) -> None:
         self.tracker, self.poses, self.variance = tracker, poses.copy(), np.zeros((len(poses), len(JOINTS)))
+        self._evidence = lru_cache(AT_ONCE)(evidence)
         self._shown, self._frames, self._follows, self._share, self._advance = shown, frames, follows, share, advance
 
     def decide(self, modes: Float | None) -> None:
@@ -204,13 +204,13 @@ class Choice:
             poses[:, frames] = self._settled(alternatives, poses[:, frames], frames, seen)
             for i in frames.tolist():
                 if len(differ := np.flatnonzero((poses[:, i] != self.poses[i]).any(axis=1))):
-                    cost[differ, i] = self._more(seen(i), i, poses[differ, i])
+                    cost[differ, i] = self._more(i, poses[differ, i])
         found = cost <= DROPPED
         return Tracks(np.where(found[..., None], poses, self.poses), found, cost)
 
-    def _more(self, pyramid: Pyramid, i: int, poses: Float) -> Float:
+    def _more(self, i: int, poses: Float) -> Float:
         """Return (B,) by how much poses (B, D) cost more than the present one in frame i, nats."""
-        cost = self.tracker.cost(pyramid, np.concatenate([self.poses[i][None], poses]))
+        cost = self._evidence(i).cost(self.tracker.body, np.concatenate([self.poses[i][None], poses]))
         return np.asarray(cost[1:] - cost[0])
 
     def _track(self, alternatives: Sequence[Alternative], begun: Tracks, step: int) -> Tracks:
@@ -245,15 +245,13 @@ class Choice:
                 differ = (poses != present).any(axis=1)
                 more = np.where(np.isnan(known), begun.cost[:, i], np.inf)
                 if len(asked := np.flatnonzero(differ & ~np.isfinite(more))):
-                    more[asked] = self._more(seen(i), i, poses[asked])
+                    more[asked] = self._more(i, poses[asked])
                 mean[differ] = np.where(np.isnan(known), more, known + RENEWAL * (more - known))[differ]
                 mean[mean > DROPPED] = np.nan
                 kept = np.flatnonzero(np.isfinite(mean))
                 if len(kept):
-                    # a limb behind other people costs nothing, and only the first pass sees its colours
-                    hidden = SHARED * (seen(i).masks[0] == OTHERS).any()
                     result[kept, i], found[kept, i] = poses[kept], True
-                    cost[kept, i] = self._share[i] * more[kept] + hidden
+                    cost[kept, i] = self._share[i] * more[kept]
         return Tracks(result, found, cost)
 
     def _joined(self, i: int, step: int) -> bool:

@@ -34,8 +34,8 @@ from tk.model.cameras.landmark_agreement import consensus
 from tk.model.cameras.tracker_frame import TrackerFrame
 from tk.model.cues import landmarks
 from tk.model.cues.cue import Cue
-from tk.model.cues.part_colors import PartColors, RenderedBody
-from tk.model.cues.ray_costs import Evidence, RayGrid
+from tk.model.cues.part_colors import PartColors, RenderedBody, color_bins
+from tk.model.cues.ray_costs import Evidence, RayGrid, unpacked
 from tk.model.masks.silhouettes import Pyramid, Views
 from tk.model.setup import Subject
 from tk.optim import gauss_newton
@@ -414,10 +414,19 @@ class ContourFinder:
 
     def evidence(self, grid: RayGrid, frame: Frame, pyramid: Pyramid) -> Evidence:
         """Return the costs of a frame on a grid of rays, and by its cues."""
-        colors, doubt = (self.colors, frame.doubt) if frame.images.size else (None, None)
-        if doubt is not None:
-            doubt = grid.nearest(self.fine_grid, doubt)
-        return Evidence.of(grid, pyramid.masks[0], frame.uncertain, frame.images, colors, self.cues(pyramid), doubt)
+        cues = self.cues(pyramid)
+        if not frame.images.size:
+            return Evidence.of(grid, pyramid.masks[0], frame.uncertain, cues=cues)
+        bins = color_bins(grid.sample(frame.images))
+        doubt = None if frame.doubt is None else grid.nearest(self.fine_grid, frame.doubt)
+        return Evidence.of(grid, pyramid.masks[0], frame.uncertain, bins, self.colors, cues, doubt)
+
+    def kept_evidence(self, pyramid: Pyramid, colors: NDArray[np.uint16] | None) -> Evidence:
+        """Return the costs of a frame on :attr:`coarse_grid` by its silhouettes, its cues, and the colours that were
+        kept of it, as in :class:`~tk.trackers.protocol.Estimate`."""
+        bins, doubt = unpacked(colors)
+        cues = self.cues(pyramid)
+        return Evidence.of(self.coarse_grid, pyramid.masks[0], None, bins, self.colors, cues, doubt)
 
     def see(self, frame: Frame, images: NDArray[np.uint8] | None = None, pyramid: Pyramid | None = None) -> Seen:
         """Return what a frame shows; ``images`` as in :meth:`settle`, ``pyramid`` that of the frame, if known."""

@@ -86,7 +86,8 @@ class Estimate:
             of the person's pixels, NaN for a camera that was not used; their sum is E_S. None if not measured.
         masks: (C, H, W) uint8, what the tracker took for the person, cleaned; None where that is the observation's, and
             in what :func:`tk.track` hands out. drawn: (C, h, w) bool, where the body is on the tracker's grid of rays,
-            cameras left out included; None likewise.
+            cameras left out included; colors: (C, h, w) what the masks show there, see
+            :meth:`tk.model.cues.ray_costs.Evidence.packed_colors`; None likewise.
         mask_source: (C,) uint8, as ``Frame.sources``.
         landmarks: (C, L, 4) those of this person among ``Frame.landmarks``; None if there are none.
         found: the reason that the frame itself shows.
@@ -111,6 +112,7 @@ class Estimate:
     residual: Float | None = None
     masks: NDArray[np.uint8] | None = None
     drawn: NDArray[np.bool_] | None = None
+    colors: NDArray[np.uint16] | None = None
     mask_source: NDArray[np.uint8] | None = None
     landmarks: Float | None = None
     found: Reason = Reason.NONE
@@ -120,6 +122,11 @@ class Estimate:
     frame: int = -1
     time: float = 0.0
     person: int = 0
+
+    @property
+    def light(self) -> Estimate:
+        """The estimate without what is large, or a view into the ring of frames."""
+        return replace(self, masks=None, drawn=None, colors=None)
 
     @property
     def reason(self) -> Reason:
@@ -266,8 +273,8 @@ class TwoPassTracker(Tracker, Protocol):
         """Return masks (C, H, W) without specks and small holes, as :meth:`second_pass` takes them."""
         ...
 
-    def without_foreign(self, frame: Frame) -> Frame:
-        """Return the frame without things in its masks that are not the person."""
+    def kept(self, frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.uint16] | None]:
+        """Return what a second pass needs of a frame that was tracked: masks and colors as in :class:`Estimate`."""
         ...
 
     def with_cameras(self, rig: Rig) -> TwoPassTracker:
@@ -324,6 +331,7 @@ class TwoPassTracker(Tracker, Protocol):
         height_m: float | None,
         measured: Measured | None = None,
         modes: Float | None = None,
+        colors: Sequence[NDArray[np.uint16] | None] | None = None,
         keep_body: bool = False,
         report: Callable[[float], None] = lambda _: None,
     ) -> tuple[Float, Float, Float]:
@@ -337,6 +345,7 @@ class TwoPassTracker(Tracker, Protocol):
             height_m: the subject's height, if known.
             measured: of F frames, in the first pass; None: nothing.
             modes: (F, 2, D) other poses of the limbs that the first pass left open, as in :class:`Estimate`.
+            colors: (C, h, w) of F frames, as in :class:`Estimate`; None where they are not known.
             keep_body: leave the body as it is.
             report: receives the share of the work that is done.
 

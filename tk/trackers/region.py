@@ -307,6 +307,7 @@ class RegionTracker(ContourTracker[RegionState]):
             residual=look.residual,
             masks=pyramid.masks[0],
             drawn=look.label > 0,
+            colors=evidence.packed_colors(),
             landmarks=seen.pyramid.measured.get(landmarks.NAME),
         )
 
@@ -326,6 +327,11 @@ class RegionTracker(ContourTracker[RegionState]):
         if marked is None:
             return None
         return self.see(frame, seen.images, replace(pyramid, measured={**pyramid.measured, landmarks.NAME: marked}))
+
+    def kept(self, frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.uint16] | None]:
+        """See :class:`~tk.trackers.protocol.TwoPassTracker`."""
+        seen = self.see(self.without_foreign(frame))
+        return seen.pyramid.masks[0], seen.evidence.packed_colors()
 
     def without_foreign(self, frame: Frame) -> Frame:
         """Return the frame with masks that exclude carried objects: large areas of colours that are not the person's.
@@ -540,7 +546,7 @@ class RegionTracker(ContourTracker[RegionState]):
     ) -> tuple[Float, Float]:
         """See :class:`~tk.trackers.protocol.TwoPassTracker`."""
         inside = self.world.poses_in(poses)
-        again = SecondPass(self, masks, measured or {}, None, inside, lost, residual, lambda _: None)
+        again = SecondPass(self, masks, measured or {}, None, None, inside, lost, residual, lambda _: None)
         again.follow()
         return np.where(lost[:, None], poses, self.world.poses_out(again.poses)), again.residual
 
@@ -553,6 +559,7 @@ class RegionTracker(ContourTracker[RegionState]):
         height_m: float | None,
         measured: Measured | None = None,
         modes: Float | None = None,
+        colors: Sequence[NDArray[np.uint16] | None] | None = None,
         keep_body: bool = False,
         report: Callable[[float], None] = lambda _: None,
     ) -> tuple[Float, Float, Float]:
@@ -560,7 +567,7 @@ class RegionTracker(ContourTracker[RegionState]):
         if lost.all():
             return poses, residual, np.zeros((len(poses), len(JOINTS)))
         inside = self.world.poses_in(poses)
-        again = SecondPass(self, masks, measured or {}, modes, inside, lost, residual, report)
+        again = SecondPass(self, masks, measured or {}, modes, colors, inside, lost, residual, report)
         if self.contours.adapt and not keep_body:
             again.fit_body(height_m)
         again.settle()

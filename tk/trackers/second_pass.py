@@ -28,7 +28,7 @@ from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.bundle import LONGEST_STEP, SEGMENT_M
 from tk.model.cues import landmarks
 from tk.model.cues.cue import Measured, in_frames
-from tk.model.cues.ray_costs import residual_of
+from tk.model.cues.ray_costs import Evidence, residual_of
 from tk.model.masks.silhouettes import Pyramid
 from tk.model.motion.coupling import MotionTerm
 from tk.optim.trajectory import Equations
@@ -61,6 +61,7 @@ class SecondPass:
         masks: (C, H, W) of each frame, cleaned.
         measured: of F frames, see :mod:`tk.model.cues.cue`.
         modes: (F, 2, D) other poses of the limbs that each frame leaves open; None if they are unknown.
+        colors: (C, h, w) of each frame, as in :class:`~tk.trackers.protocol.Estimate`; None where they are unknown.
         poses: (F, D) of the first pass.
         lost: (F,) bool; such frames are not used and do not change.
         residual: (F, C, 2) of the first pass; a camera whose residual is NaN in a frame is not used in it.
@@ -77,13 +78,14 @@ class SecondPass:
         masks: Sequence[NDArray[np.uint8]],
         measured: Measured,
         modes: Float | None,
+        colors: Sequence[NDArray[np.uint16] | None] | None,
         poses: Float,
         lost: NDArray[np.bool_],
         residual: Float,
         report: Callable[[float], None],
     ) -> None:
         self.tracker, self._masks, self._report = tracker, masks, report
-        self._measured, self._modes = measured, modes
+        self._measured, self._modes, self._colors = measured, modes, colors
         self.tracked = np.flatnonzero(~lost)
         self._share = np.ones(len(poses))
         steps, seen = _steps(tracker.body.skeleton.joints(poses[self.tracked])), len(self.tracked)
@@ -195,6 +197,7 @@ class SecondPass:
         choice = Choice(
             self.tracker,
             lambda k: self._pyramid(frames[k], LEVEL + 1),
+            lambda k: self._evidence(frames[k]),
             frames,
             np.diff(rows) == np.diff(frames),
             self.poses[frames],
@@ -235,6 +238,10 @@ class SecondPass:
         if not used.all():
             shown = np.where(used[:, None, None], shown, np.uint8(0))
         return self.tracker.views.pyramid(shown, scales, False, in_frames(self._measured, i, used))
+
+    def _evidence(self, i: int) -> Evidence:
+        """Return the costs of frame i, with the colours that are known."""
+        return self.tracker.kept_evidence(self._pyramid(i), None if self._colors is None else self._colors[int(i)])
 
 
 def _steps(joints: Float) -> Float:

@@ -109,13 +109,15 @@ def test_masks_of_a_killed_run_are_read_up_to_the_damage(seed, tmp_path_factory)
     rng = np.random.default_rng(seed)
     path = tmp_path_factory.mktemp("run") / ".r.h5.masks"
     masks = (rng.random((6, 2, 7, 9)) < 0.5).astype(np.uint8) * 255
+    colors = rng.integers(0, 1 << 16, (6, 2, 3, 4), np.uint16)
     store = MaskStore(path)
     assert not path.exists(), "the first put creates it"
     for index, frame in enumerate(masks):
-        store.put(index, frame)
+        store.put(index, frame, colors[index] if index % 2 else None)
     whole = MaskStore(path, resume=True)
     for index, frame in enumerate(masks):
         np.testing.assert_array_equal(whole.get(index), frame)
+        assert index % 2 or whole.colors(index) is None
     data = bytearray(path.read_bytes())
     kept = len(data) // 6 * int(rng.integers(0, 6)) + int(rng.integers(0, 30))
     path.write_bytes(bytes(data[:kept]) + rng.bytes(int(rng.integers(0, 40))))
@@ -124,6 +126,8 @@ def test_masks_of_a_killed_run_are_read_up_to_the_damage(seed, tmp_path_factory)
     assert found == list(range(len(found)))
     for index in found:
         np.testing.assert_array_equal(after.get(index), masks[index])
+        if index % 2:
+            np.testing.assert_array_equal(after.colors(index), colors[index])
     after.put(5, masks[5])
     np.testing.assert_array_equal(MaskStore(path, resume=True).get(5), masks[5])
     MaskStore(path).put(0, masks[0])

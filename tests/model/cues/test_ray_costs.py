@@ -7,13 +7,14 @@ import pytest
 
 from tests.model.figures import BODY, draw_silhouettes
 from tests.model.ring import ring_of_cameras
+from tk.kernels.line_search import COLOR_BINS
 from tk.kernels.mask_values import OTHERS
 from tk.kernels.raycast import costs
 from tk.model.body.cone_body import COLOR_GROUPS
 from tk.model.body.gait_poses import walking_pose
 from tk.model.cameras.camera import Rig
-from tk.model.cues.part_colors import PartColors
-from tk.model.cues.ray_costs import UNCERTAIN_COST, Evidence, RayGrid, mean_of_views
+from tk.model.cues.part_colors import PartColors, color_bins
+from tk.model.cues.ray_costs import UNCERTAIN_COST, Evidence, RayGrid, mean_of_views, unpacked
 from tk.model.masks.silhouettes import share_wrong
 
 RIG = ring_of_cameras(3, width=120, height=160)
@@ -104,22 +105,17 @@ def test_color_of_another_part_costs():
     for p, g in enumerate(BODY.color_group, 1):
         level = palette[g]
         lookup[p] = (level, 255 - level, (7 * level) % 255)
-    images = lookup[label]
-    colors = PartColors(BODY)
-    blind = Evidence.of(FINE, MASKS, None, images, colors)
-    assert blind.bins is not None
-    colors.learn(blind.bins[label > 0], label[label > 0])
-    right = by_view(Evidence.of(FINE, MASKS, None, images, colors), POSES[:1])
+    bins, colors = color_bins(lookup[label]), PartColors(BODY)
+    colors.learn(bins[label > 0], label[label > 0])
+    right = by_view(Evidence.of(FINE, MASKS, None, bins, colors), POSES[:1])
     assert right.max() < 0.02
     arm, trunk = (GROUP_OF[name] for name in ("forearm_l", "chest"))
     swapped = label.copy()
     is_arm, is_trunk = (np.isin(label, np.flatnonzero(BODY.color_group == g) + 1) for g in (arm, trunk))
     swapped[is_arm], swapped[is_trunk] = NAMES.index("chest") + 1, NAMES.index("forearm_l") + 1
-    wrong = by_view(Evidence.of(FINE, MASKS, None, lookup[swapped], colors), POSES[:1])
+    wrong = by_view(Evidence.of(FINE, MASKS, None, color_bins(lookup[swapped]), colors), POSES[:1])
     share = (is_arm | is_trunk).sum(axis=(1, 2)) / (MASKS > 0).sum(axis=(1, 2))
     np.testing.assert_allclose(wrong[0], UNCERTAIN_COST * share, rtol=0.1)
-    # no pictures, no colours
-    assert Evidence.of(FINE, MASKS, None, images[:0], colors).bins is None
 
 
 def test_doubt_costs_what_neither_the_other_person_nor_the_part_explains():
@@ -129,9 +125,9 @@ def test_doubt_costs_what_neither_the_other_person_nor_the_part_explains():
     images = rng.integers(0, 256, (*label.shape, 3), np.uint8)
     masks = np.where((label > 0) & (np.arange(120) > 60), OTHERS, MASKS).astype(np.uint8)
     colors, doubt = PartColors(BODY), rng.random(label.shape, np.float32)
-    bins = Evidence.of(FINE, masks, None, images).bins
+    bins = color_bins(images)
     colors.learn(bins[label > 0], label[label > 0])
-    sure, doubted = (Evidence.of(FINE, masks, None, images, colors, doubt=d) for d in (None, doubt))
+    sure, doubted = (Evidence.of(FINE, masks, None, bins, colors, doubt=d) for d in (None, doubt))
     others = masks == OTHERS
     assert not sure.rays[others].any() and others.any()
     np.testing.assert_array_equal(doubted.rays[~others], sure.rays[~others])
@@ -139,6 +135,22 @@ def test_doubt_costs_what_neither_the_other_person_nor_the_part_explains():
         d, own = doubt[tuple(ray)], colors.mismatch[bins[tuple(ray)]]
         expected = UNCERTAIN_COST * np.array([d, *(min(d, one) for one in own)], np.float32)
         np.testing.assert_allclose(doubted.rays[tuple(ray)], expected, rtol=1e-6)
+
+
+def test_packed_colors_say_what_the_rays_through_the_masks_say():
+    """Of all colours, and of doubts between no doubt and a full one, nothing is lost but a fifteenth of the doubt."""
+    rng = np.random.default_rng(7)
+    shape = FINE.rays.shape[:3]
+    masks = rng.choice(np.array([0, OTHERS, 255], np.uint8), shape)
+    bins, doubt = rng.integers(0, COLOR_BINS, shape, np.int32), rng.random(shape, np.float32)
+    doubt[0], doubt[1] = 0.0, 1.0
+    evidence, shown = Evidence.of(FINE, masks, None, bins, doubt=doubt), masks > 0
+    found_bins, found_doubt = unpacked(evidence.packed_colors())
+    np.testing.assert_array_equal(found_bins[shown], bins[shown])
+    np.testing.assert_allclose(found_doubt[shown], doubt[shown], atol=0.5 / 15 + 1e-6)
+    np.testing.assert_array_equal(found_doubt[:2][shown[:2]], doubt[:2][shown[:2]])
+    assert not found_bins[~shown].any() and not found_doubt[~shown].any()
+    assert Evidence.of(FINE, masks).packed_colors() is None and unpacked(None) == (None, None)
 
 
 @pytest.mark.parametrize("rows", [40, 54, 160])

@@ -1,5 +1,7 @@
 """Masks of a whole recording in little memory: one bit for each pixel of a box around the person, compressed.
 
+What the masks' pixels show may be kept, too: for each ray of a tracker's grid a number of 16 bits.
+
 Masks of a long recording are stored in a file: a temporary one without a name, or one beside the result, with which a
 killed run can be resumed.
 """
@@ -12,9 +14,9 @@ import struct
 import tempfile
 import weakref
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import IO, overload
+from typing import IO, TypeVar, overload
 
 import cv2
 import numpy as np
@@ -24,15 +26,19 @@ from tk.errors import FULL, DiskFullError, TkError
 from tk.kernels.mask_values import OTHERS, PERSON
 
 Masks = NDArray[np.uint8]
+Colors = NDArray[np.uint16]
+T = TypeVar("T")
 
 #: most bytes in memory; larger stores are on disk
 IN_MEMORY = 32_000_000
 
 
-#: header of each frame: its number (~number for the pixels of other people), the number of bytes that follow, and the
-#: masks' shape. Compressed bytes follow: left, top, width, height of each camera's box, and the boxes' bits.
-_HEAD = struct.Struct("<qqiii")
-_BOX = np.dtype("<i4")
+#: header of each record: the frame's number, the kind of the record, the number of bytes that follow, and the shape of
+#: what they hold. Compressed bytes follow: of masks left, top, width, height of each camera's box, and the boxes' bits;
+#: of colours the numbers.
+_HEAD = struct.Struct("<qiqiii")
+_PERSON, _OTHERS, _COLORS = range(3)
+_BOX, _COLOR = np.dtype("<i4"), np.dtype("<u2")
 
 
 class MaskStore:
@@ -45,8 +51,9 @@ class MaskStore:
 
     def __init__(self, path: Path | None = None, resume: bool = False) -> None:
         self._path = path
-        self._places: dict[int, tuple[int, int]] = {}  # start and size of each frame, bytes
-        self._shape: tuple[int, ...] = ()
+        # start and size of each record, bytes, by number and kind
+        self._places: dict[tuple[int, int], tuple[int, int]] = {}
+        self._shapes: dict[int, tuple[int, ...]] = {}  # of masks and colours, by kind
         self._opened: IO[bytes] | None = None
         if path is not None and resume and path.is_file():
             self._take_up(self._open("r+b"))
@@ -67,63 +74,74 @@ class MaskStore:
         return kind(f"{where}: masks cannot be kept there: {error.strerror or error}")
 
     def _take_up(self, file: IO[bytes]) -> None:
-        """Find the frames in the file; cut off the file at the first damaged frame."""
+        """Find the frames in the file; cut off the file at the first damaged record."""
         whole, end = os.fstat(file.fileno()).st_size, 0
         while end + _HEAD.size <= whole:
-            index, size, *shape = _HEAD.unpack(file.read(_HEAD.size))
+            index, kind, size, *shape = _HEAD.unpack(file.read(_HEAD.size))
             begin = end + _HEAD.size
-            if not 0 < size <= whole - begin or min(shape) <= 0 or self._shape not in ((), tuple(shape)):
+            if not 0 < size <= whole - begin or min(shape) <= 0 or self._shapes.get(kind, tuple(shape)) != tuple(shape):
                 break
-            if not _is_whole(file.read(size), shape):
+            if not _is_whole(file.read(size), kind, shape):
                 break
-            self._shape, self._places[index], end = tuple(shape), (begin, size), begin + size
+            self._shapes[kind], self._places[index, kind], end = tuple(shape), (begin, size), begin + size
         file.truncate(end)
 
     def __contains__(self, index: int) -> bool:
-        return index in self._places
+        return (index, _PERSON) in self._places
 
-    def put(self, index: int, masks: Masks) -> None:
-        """Store a frame's masks; values of 128 and more are the person.
+    def put(self, index: int, masks: Masks, colors: Colors | None = None) -> None:
+        """Store a frame's masks, values of 128 and more are the person, and what they show, (C, h, w).
 
         Raises:
             TkError: the file cannot be written, for example because the disk is full.
         """
         boxes = np.array([cv2.boundingRect(mask) for mask in masks], _BOX)
         crops = [mask[y : y + h, x : x + w] for mask, (x, y, w, h) in zip(masks, boxes, strict=True)]
-        if any((crop == OTHERS).any() for crop in crops):  # first: a frame whose masks are in the file is whole
-            self._put(~index, masks.shape, boxes, [crop == OTHERS for crop in crops])
-        self._put(index, masks.shape, boxes, [crop >= PERSON for crop in crops])
+        if colors is not None:  # first, as pixels of others: a frame whose masks are in the file is whole
+            self._put(index, _COLORS, colors.shape, colors.astype(_COLOR).tobytes())
+        for kind, drawn in (
+            (_OTHERS, [crop == OTHERS for crop in crops]),
+            (_PERSON, [crop >= PERSON for crop in crops]),
+        ):
+            if kind == _PERSON or any(one.any() for one in drawn):
+                bits = np.packbits(np.concatenate([one.ravel() for one in drawn]))
+                self._put(index, kind, masks.shape, boxes.tobytes() + bits.tobytes())
 
-    def _put(
-        self, index: int, shape: tuple[int, ...], boxes: NDArray[np.int32], crops: Sequence[NDArray[np.bool_]]
-    ) -> None:
-        self._shape = shape
-        bits = np.packbits(np.concatenate([crop.ravel() for crop in crops]))
-        packed = zlib.compress(boxes.tobytes() + bits.tobytes(), 1)
+    def _put(self, index: int, kind: int, shape: tuple[int, ...], values: bytes) -> None:
+        self._shapes[kind] = shape
+        packed = zlib.compress(values, 1)
         file = self._opened or self._open("w+b")
         try:
             file.seek(0, os.SEEK_END)
             place = file.tell() + _HEAD.size
-            file.write(_HEAD.pack(index, len(packed), *shape) + packed)
+            file.write(_HEAD.pack(index, kind, len(packed), *shape) + packed)
             file.flush()
         except OSError as error:
             raise self._no_room(error) from None
-        self._places[index] = (place, len(packed))
+        self._places[index, kind] = (place, len(packed))
 
     def get(self, index: int) -> Masks:
         """Return the masks (C, H, W) of a stored frame."""
-        masks = np.zeros(self._shape, np.uint8)
-        self._draw(index, masks, 255)
-        if ~index in self._places:
-            self._draw(~index, masks, OTHERS)
+        masks = np.zeros(self._shapes[_PERSON], np.uint8)
+        for kind, value in ((_PERSON, 255), (_OTHERS, OTHERS)):
+            if (index, kind) in self._places:
+                self._draw(self._read(index, kind), masks, value)
         return masks
 
-    def _draw(self, index: int, masks: Masks, value: int) -> None:
-        """Set the stored pixels of masks (C, H, W) to a value."""
-        place, size = self._places[index]
+    def colors(self, index: int) -> Colors | None:
+        """Return what the masks of a frame show, (C, h, w); None if that is not stored."""
+        if (index, _COLORS) not in self._places:
+            return None
+        return np.frombuffer(self._read(index, _COLORS), _COLOR).reshape(self._shapes[_COLORS])
+
+    def _read(self, index: int, kind: int) -> bytes:
+        place, size = self._places[index, kind]
         assert self._opened is not None
         self._opened.seek(place)
-        stored = zlib.decompress(self._opened.read(size))
+        return zlib.decompress(self._opened.read(size))
+
+    def _draw(self, stored: bytes, masks: Masks, value: int) -> None:
+        """Set the stored pixels of masks (C, H, W) to a value."""
         boxes = np.frombuffer(stored, _BOX, 4 * len(masks)).reshape(-1, 4)
         bits = np.unpackbits(np.frombuffer(stored, np.uint8, offset=boxes.nbytes))
         begin = 0
@@ -136,27 +154,35 @@ class MaskStore:
         if not cameras.any():
             return self
         result = MaskStore()
-        for index in self._places:
-            if index >= 0:
+        for index, kind in self._places:
+            if kind == _PERSON:
                 masks = self.get(index)
                 masks[cameras] = 0
-                result.put(index, masks)
+                result.put(index, masks, self.colors(index))
         return result
 
-    def sequence(self, indices: NDArray[np.int64]) -> Frames:
+    def sequence(self, indices: NDArray[np.int64]) -> Frames[Masks]:
         """Return the masks of these frames, unpacked on access."""
-        return Frames(self, [int(i) for i in indices])
+        return Frames(self.get, indices.tolist())
+
+    def color_sequence(self, indices: NDArray[np.int64]) -> Frames[Colors | None]:
+        """Return what the masks of these frames show, as :meth:`colors`, unpacked on access."""
+        return Frames(self.colors, indices.tolist())
 
 
-def _is_whole(packed: bytes, shape: Sequence[int]) -> bool:
-    """Return whether a stored frame holds boxes inside masks of a shape (C, H, W), and all of the boxes' bits."""
+def _is_whole(packed: bytes, kind: int, shape: Sequence[int]) -> bool:
+    """Return whether a record holds all numbers of a shape (C, h, w), or boxes inside masks of a shape (C, H, W), and
+    all of the boxes' bits."""
     cameras, height, width = shape
-    head = 4 * _BOX.itemsize * cameras
+    head, numbers = 4 * _BOX.itemsize * cameras, _COLOR.itemsize * cameras * height * width
     reader = zlib.decompressobj()
     try:
-        stored = reader.decompress(packed, head + cameras * height * width // 8 + 2)
+        most = numbers if kind == _COLORS else head + cameras * height * width // 8
+        stored = reader.decompress(packed, most + 2)
     except zlib.error:
         return False
+    if kind == _COLORS:
+        return reader.eof and len(stored) == numbers
     if not reader.eof or len(stored) < head:
         return False
     x, y, w, h = np.frombuffer(stored, _BOX, 4 * cameras).reshape(-1, 4).T.astype(np.int64)
@@ -192,25 +218,22 @@ class MaskStores:
         return self._result.with_name(f".{self._result.name}.masks" + (f".{person}" if person else ""))
 
 
-class Frames(Sequence[Masks]):
-    """A sequence of masks that holds one at a time."""
+class Frames(Sequence[T]):
+    """A sequence of what is stored of frames, which holds one at a time."""
 
-    def __init__(self, store: MaskStore, indices: list[int]) -> None:
-        self._store, self._indices = store, indices
+    def __init__(self, get: Callable[[int], T], indices: list[int]) -> None:
+        self._get, self._indices = get, indices
 
     def __len__(self) -> int:
         return len(self._indices)
 
     @overload
-    def __getitem__(self, i: int) -> Masks: ...
+    def __getitem__(self, i: int) -> T: ...
 
     @overload
-    def __getitem__(self, i: slice) -> Frames: ...
+    def __getitem__(self, i: slice) -> Frames[T]: ...
 
-    def __getitem__(self, i: int | slice) -> Masks | Frames:
+    def __getitem__(self, i: int | slice) -> T | Frames[T]:
         if isinstance(i, slice):
-            return Frames(self._store, self._indices[i])
-        return self._store.get(self._indices[i])
-
-    def __iter__(self) -> Iterator[Masks]:
-        return (self._store.get(i) for i in self._indices)
+            return Frames(self._get, self._indices[i])
+        return self._get(self._indices[i])

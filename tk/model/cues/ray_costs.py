@@ -16,13 +16,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.kernels.line_search import COLOR_BINS
 from tk.kernels.mask_values import OTHERS, PERSON
 from tk.kernels.projection import pack_cameras
 from tk.kernels.raycast import Cast, Rays, cast, costs
 from tk.model.body.cone_body import COLOR_GROUPS, ConeBody
 from tk.model.cameras.camera import Rig
 from tk.model.cues.cue import Cue
-from tk.model.cues.part_colors import PartColors, color_bins
+from tk.model.cues.part_colors import PartColors
 from tk.model.reduced_images import every
 
 Float = NDArray[np.float64]
@@ -37,6 +38,8 @@ VIEW_NATS = 60.0
 # divisor is at least this share of the largest number in any view, so that a hand beside a back counts less than a
 # person.
 LEAST_SEEN = 0.25
+# Steps of a packed doubt: what is left of 16 bits beside the bin of a colour.
+_DOUBT_STEPS = (np.iinfo(np.uint16).max + 1) // COLOR_BINS - 1
 
 
 def pixel_rays(rig: Rig, step: int = 1) -> NDArray[np.float32]:
@@ -112,13 +115,13 @@ class Evidence:
         grid: RayGrid,
         masks: NDArray[np.uint8],
         uncertain: NDArray[np.bool_] | None = None,
-        images: NDArray[np.uint8] | None = None,
+        bins: NDArray[np.int32] | None = None,
         colors: PartColors | None = None,
         cues: Sequence[Cue] = (),
         doubt: NDArray[np.float32] | None = None,
     ) -> Evidence:
-        """Return the evidence of masks (V, H, W), uncertain pixels, images, the learned colours of the parts, other
-        cues, and the doubt (V, h, w) on the grid."""
+        """Return the evidence of masks (V, H, W), uncertain pixels, the bins (V, h, w) of the rays' colours, the
+        learned colours of the parts, other cues, and the doubt (V, h, w) of the rays."""
         sampled = np.ascontiguousarray(grid.sample(masks))
         person, others = sampled >= PERSON, sampled == OTHERS
         outside = np.ones(person.shape, np.float32)
@@ -130,7 +133,6 @@ class Evidence:
         rays = np.empty((*person.shape, len(COLOR_GROUPS) + 1), np.float32)
         rays[..., 0] = person
         rays[..., 1:] = np.where(person, 0.0, outside)[..., None]
-        bins = None if images is None or images.size == 0 else color_bins(grid.sample(images))
         if bins is not None and colors is not None and colors.known:
             on_person = np.flatnonzero(person)  # several times as fast as a mask as an index
             of_colors = colors.mismatch.take(bins.ravel().take(on_person), axis=0)
@@ -140,6 +142,16 @@ class Evidence:
                 rays[others, :1] = UNCERTAIN_COST * of_other
                 rays[others, 1:] = UNCERTAIN_COST * np.minimum(of_other, of_colors)
         return Evidence(grid, person, rays, bins, others if shared else None, cues, doubt)
+
+    def packed_colors(self) -> NDArray[np.uint16] | None:
+        """Return (V, h, w) colours and doubt of the rays through the masks, in 16 bits, see :func:`unpacked`; None
+        without colours."""
+        if self.bins is None:
+            return None
+        packed = self.bins.astype(np.uint16)
+        if self.doubt is not None:
+            packed += COLOR_BINS * np.rint(_DOUBT_STEPS * self.doubt).astype(np.uint16)
+        return np.where(self.person if self.others is None else self.person | self.others, packed, np.uint16(0))
 
     def mismatch(
         self,
@@ -218,6 +230,14 @@ class Evidence:
     def surplus(self, label: NDArray[np.uint8]) -> float:
         """Return the surplus area, mean over the views; labels (V, h, w)."""
         return float(mean_of_views(self.residual(label)[None, :, 1])[0])
+
+
+def unpacked(colors: NDArray[np.uint16] | None) -> tuple[NDArray[np.int32] | None, NDArray[np.float32] | None]:
+    """Return the bins and the doubt, (V, h, w), of what :meth:`Evidence.packed_colors` has packed."""
+    if colors is None:
+        return None, None
+    doubt, bins = np.divmod(colors, np.uint16(COLOR_BINS))
+    return bins.astype(np.int32), doubt.astype(np.float32) / np.float32(_DOUBT_STEPS)
 
 
 def residual_of(body: NDArray[np.bool_], person: NDArray[np.bool_], others: NDArray[np.bool_] | None = None) -> Float:
