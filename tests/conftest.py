@@ -239,6 +239,32 @@ def causal(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def first_frame(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The results, read-only, of the first pass over one frame, of the methods region and volumetric."""
+    from tk.io.captures.capture import open_capture
+
+    def make(folder: Path) -> None:
+        folder.mkdir()
+        for method in ("region", "volumetric"):
+            config = settings_file.from_toml(QUICK)
+            track(open_capture(tiny), folder / f"{method}.h5", config, method=method, frames=(0, 1), causal=True)
+
+    folder = made_once(tmp_path_factory, "first frame", make)
+    return {path.stem: path for path in folder.iterdir()}
+
+
+def as_if_killed(causal: Path, path: Path) -> Path:
+    """Copy the result of a first pass, as it is before anything is computed from all of its frames."""
+    import h5py
+
+    shutil.copyfile(causal, path)
+    with h5py.File(path, "r+") as file:
+        del file["people/0/smoothed"]
+        del file["cameras"]
+    return path
+
+
+@pytest.fixture(scope="session")
 def refined(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same with the second pass, which has nothing to report."""
     from tk.io.captures.capture import open_capture

@@ -12,8 +12,8 @@ import pytest
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
 #: options that make the examples short
 OPTIONS = {
-    "01_track_and_plot": ["--frames", "4", "--out", "out"],
-    "02_compare_methods_and_cameras": ["--frames", "2"],
+    "01_track_and_plot": ["--frames", "2", "--out", "out"],
+    "02_compare_methods_and_cameras": ["--frames", "1"],
     "03_hulls_to_open3d": ["--frames", "1", "--voxels", "32", "--out", "out"],
 }
 
@@ -35,7 +35,7 @@ def test_example_runs(
     runpy.run_path(str(example), run_name="__main__")
     said = capfd.readouterr().out
     if example.stem.startswith("01"):
-        assert "4 frames, 0 lost" in said
+        assert "2 frames, 0 lost" in said
         assert cv2.imread(str(tmp_path / "out" / "motion.png")).std() > 5  # the image is not blank
     elif example.stem.startswith("02"):
         means = [float(line[28:].split()[0]) for line in said.splitlines()[1:]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import subprocess
 import sys
@@ -30,7 +31,16 @@ def imports(node: ast.AST) -> Iterator[str]:
         yield from imports(child)
 
 
-IMPORTS = {name: set(imports(ast.parse(file.read_text(encoding="utf-8")))) - {name} for name, file in FILES.items()}
+@functools.cache
+def tree(name: str) -> ast.Module:
+    """Return the syntax tree of a module."""
+    return ast.parse(FILES[name].read_text(encoding="utf-8"))
+
+
+@functools.cache
+def imported(name: str) -> set[str]:
+    """Return the modules of tk that a module imports."""
+    return set(imports(tree(name))) - {name}
 
 
 def member(module: str) -> str:
@@ -54,8 +64,8 @@ def test_imports_go_to_lower_levels_only() -> None:
     level = levels()
     wrong = [
         f"{name} imports {other}"
-        for name, found in IMPORTS.items()
-        for other in sorted(found)
+        for name in FILES
+        for other in sorted(imported(name))
         if member(name) in level
         and member(other) in level
         and member(name) != member(other)
@@ -70,11 +80,11 @@ def test_no_module_imports_itself_through_others() -> None:
     def visit(name: str, path: tuple[str, ...]) -> None:
         assert name not in path, " → ".join((*path[path.index(name) :], name))
         if name not in done:
-            for other in sorted(IMPORTS[name]):
+            for other in sorted(imported(name)):
                 visit(other, (*path, name))
             done.add(name)
 
-    for name in IMPORTS:
+    for name in FILES:
         visit(name, ())
 
 
@@ -116,12 +126,7 @@ def of_some_systems(tree: ast.AST) -> Iterator[str]:
 
 
 def test_only_one_package_uses_what_some_systems_lack() -> None:
-    found = {
-        f"{name}: {used}"
-        for name, file in FILES.items()
-        if member(name) != "system"
-        for used in of_some_systems(ast.parse(file.read_text(encoding="utf-8")))
-    }
+    found = {f"{name}: {used}" for name in FILES if member(name) != "system" for used in of_some_systems(tree(name))}
     assert not found
 
 

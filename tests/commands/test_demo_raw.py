@@ -34,12 +34,14 @@ def fourth(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return read_raw(folder)[0]
 
 
+@pytest.mark.slow
 def test_images_have_the_times_of_a_camera_that_starts_later(fourth: Recording) -> None:
     assert len(fourth.times_s) == round((37.0 - STARTS_S["cam4"]) * 15)
     np.testing.assert_allclose(fourth.times_s, np.arange(len(fourth.times_s)) / 15, atol=1e-4)
     assert fourth.dropped == 0
 
 
+@pytest.mark.slow
 def test_the_camera_on_its_side_is_shown_upright(fourth: Recording) -> None:
     (path,) = fourth.paths
     with av.open(str(path)) as video:
@@ -54,6 +56,7 @@ def test_the_camera_on_its_side_is_shown_upright(fourth: Recording) -> None:
             assert np.abs(shown.astype(float) - images[min(frame, len(images) - 1)]).mean() < 4
 
 
+@pytest.mark.slow
 def test_claps_are_heard_after_the_way_of_the_sound(fourth: Recording) -> None:
     track = read_track(fourth)
     assert track is not None

@@ -29,7 +29,7 @@ from tk.model.cameras.mounting import FoundUp, infer_up
 from tk.model.cameras.up import up_vector
 
 
-def turned(folder: Path, camera: int, degrees: float) -> None:
+def turn_camera(folder: Path, camera: int, degrees: float) -> None:
     """Turn a camera of the calibration to the side."""
     rig = open_capture(folder).rig
     turn = cv2.Rodrigues(np.radians([0.0, degrees, 0.0]))[0]
@@ -49,7 +49,7 @@ def test_good_capture_has_no_findings_and_gets_a_sheet(tk: Tk, tiny: Path, tmp_p
 
 
 def test_turned_camera_is_named(tk: Tk, copy: Path) -> None:
-    turned(copy, 1, 6.0)
+    turn_camera(copy, 1, 6.0)
     ran = tk("inspect", copy, "--json")
     assert ran.code == 0, ran.err
     found = json.loads(ran.out)
@@ -63,7 +63,7 @@ def test_inspect_and_track_refuse_the_cameras_of_another_recording(
     tk: Tk, quick: Path, copy: Path, tmp_path: Path
 ) -> None:
     for camera, degrees in enumerate((8.0, -9.0, -8.0, 9.0)):
-        turned(copy, camera, degrees)
+        turn_camera(copy, camera, degrees)
     ran = tk("inspect", copy, "--json")
     (first, *_) = json.loads(ran.out)["findings"]
     assert first.startswith("the cameras cam1, cam2, cam3 and cam4 do not belong together")

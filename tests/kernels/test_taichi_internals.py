@@ -1,6 +1,5 @@
 """Launches of stored kernels equal Taichi's own launches; shortened notes still name an error's place."""
 
-import inspect
 import textwrap
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
@@ -165,15 +164,6 @@ def _eight_times(x: ti.i32) -> ti.i32:
     return _twice(_twice(_twice(x)))
 
 
-def test_the_source_of_a_function_is_read_once(monkeypatch):
-    ensure_runtime()
-    read = []
-    original = inspect.getsourcelines
-    monkeypatch.setattr(inspect, "getsourcelines", lambda function: read.append(function) or original(function))
-    assert _eight_times(5) == 40
-    assert sorted(function.__name__ for function in read) == ["_eight_times", "_twice"]
-
-
 @pytest.mark.parametrize(
     "utilities, kernels",
     [
@@ -201,16 +191,3 @@ def test_an_unknown_context_gets_the_full_note():
         SimpleNamespace(ASTTransformerContext=context), SimpleNamespace(textwrap=textwrap)
     )
     assert context().get_pos_info(None) == "full"
-
-
-def test_a_callers_own_runtime_keeps_its_notes():
-    printed = run(
-        """
-        from tk.kernels.runtime import ensure_runtime, ti
-        ti.init(arch=ti.cpu, log_level=ti.ERROR)
-        ensure_runtime()
-        from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
-        print(hasattr(ASTTransformerContext.get_pos_info, "__wrapped__"))
-        """
-    )
-    assert printed[-1] == "False"

@@ -16,7 +16,6 @@ from tests.people import truth, write_people
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.captures.frames import FrameSet
 from tk.model.cameras.camera import Rig
-from tk.model.masks.foreground import CollinearityForeground
 from tk.run.learned_masks import LEARNED, LEARNED_AND_SEGMENTER, SEGMENTER
 from tk.run.segmentation import Labels, make_labeller
 from tk.run.task import Task
@@ -86,13 +85,13 @@ def test_a_note_says_why_the_segmenter_makes_all_masks(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("fps", [15.0, 10.0])  # 8 and 9 samples: with 9 the opening has its own scene
-@pytest.mark.parametrize("start", [10, 37])
-def test_masks_do_not_depend_on_the_first_frame(folder: Path, fps: float, start: int) -> None:
+def test_masks_do_not_depend_on_the_first_frame(folder: Path, fps: float) -> None:
     capture = replace(capture_of(folder)[0], fps=fps)
-    whole, part = (labels_of(capture, first) for first in (0, start))
-    for a, b in zip(whole[start:], part, strict=True):
-        for one, other in zip(a, b, strict=True):
-            np.testing.assert_array_equal(one, other)
+    whole = labels_of(capture)
+    for start in (10, 37):
+        for a, b in zip(whole[start:], labels_of(capture, start), strict=True):
+            for one, other in zip(a, b, strict=True):
+                np.testing.assert_array_equal(one, other)
 
 
 def test_opening_waits_for_eight_samples_only(folder: Path) -> None:
@@ -105,15 +104,6 @@ def test_opening_waits_for_eight_samples_only(folder: Path) -> None:
             label(frame)
             asked.append(segmenter.asked[0])
     assert asked[0] == asked[opening - 1] < asked[opening] == asked[-1]
-
-
-def test_first_frame_waits_for_no_check_of_later_samples(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    capture, label = capture_of(folder)[0], CollinearityForeground.label
-    counts = []
-    monkeypatch.setattr(CollinearityForeground, "label", lambda *a, **k: counts.append(1) or label(*a, **k))
-    with capture.frames() as frames:
-        make_labeller(Task.of(capture, Settings()), lambda _: None)(next(frames))
-    assert len(counts) == 2  # its own masks, and the check of the sample that it is
 
 
 def test_still_trunk_stays_in_the_masks(tmp_path: Path) -> None:

@@ -18,11 +18,10 @@ from tests.people import HEIGHT, WIDTH, install, truth, write_people
 from tk.errors import CaptureError, ConfigError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
-from tk.kernels.background import Statistic
 from tk.model.body.body_points import LANDMARKS
 from tk.run.mask_folder import write_masks
 from tk.run.prefetch import Ahead, open_observations
-from tk.run.segmentation import landmark_asker, make_labeller, mask_source, prepare_kernels, sees_landmarks
+from tk.run.segmentation import landmark_asker, make_labeller, mask_source, sees_landmarks
 from tk.run.task import Task
 from tk.segmenters import load, names
 from tk.segmenters.people_masks import PeopleMasks
@@ -286,10 +285,3 @@ def test_the_built_in_network_segments_a_rendered_person(tiny: Path) -> None:
     assert frame.masks is not None
     level = wrong(made.segment(frame.images), frame.masks > 0)[:3]  # the last camera looks from above
     assert level.max() < 0.3
-
-
-def test_kernel_of_the_masks_is_called_when_it_is_prepared(monkeypatch: pytest.MonkeyPatch) -> None:
-    measure, shapes = Statistic.measure, []
-    monkeypatch.setattr(Statistic, "measure", lambda self, *a, **k: shapes.append(a[4]) or measure(self, *a, **k))
-    prepare_kernels()
-    assert len(shapes) == 1

@@ -6,6 +6,7 @@ By the volumetric tracker; tests/trackers/test_region_track.py has what is the d
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -104,8 +105,8 @@ def stop_at(frame: int) -> Silent:
 
 
 def test_another_seed_gives_another_result(tiny: Path, tracked: Path, tmp_path: Path) -> None:
-    run(tiny, tmp_path / "other.h5", config=settings_file.from_toml(f"seed = 1\n{QUICK}"), frames=(0, 4))
-    assert np.abs(read_result(tmp_path / "other.h5").pose - read_result(tracked).pose[:4]).max() > 1e-6
+    run(tiny, tmp_path / "other.h5", config=settings_file.from_toml(f"seed = 1\n{QUICK}"), frames=(0, 2))
+    assert np.abs(read_result(tmp_path / "other.h5").pose - read_result(tracked).pose[:2]).max() > 1e-6
 
 
 # --- stopped and taken up again ---------------------------------------------------------------------------------------
@@ -136,17 +137,16 @@ def test_frames_are_reported_after_they_are_written(
     assert summary.interrupted and stopped.frames == [0, 1, 2, 3]  # by then all of them were finished
     assert summary.frames == summary.tracked_now == 8
     assert_same(result, tracked, slice(0, 8))
-    run(tiny, result, resume=True, store_hull=True)
-    assert_same(result, tracked)
 
 
-def test_ctrl_c_before_the_first_frame_leaves_an_older_result(tiny: Path, tmp_path: Path) -> None:
+def test_ctrl_c_before_the_first_frame_leaves_an_older_result(
+    tiny: Path, first_frame: dict[str, Path], tmp_path: Path
+) -> None:
     class Impatient(Silent):
         def begin(self, total: int, done: int) -> None:
             signal.raise_signal(signal.SIGINT)
 
-    result = tmp_path / "r.h5"
-    run(tiny, result, frames=(0, 2))
+    result = Path(shutil.copy(first_frame["volumetric"], tmp_path / "r.h5"))
     before = result.read_bytes()
     summary = track(open_capture(tiny), result, CONFIG, Impatient(), force=True)
     assert summary.interrupted and summary.frames == 0
@@ -165,8 +165,9 @@ def test_ctrl_c_before_the_first_frame_leaves_an_older_result(tiny: Path, tmp_pa
     ],
 )
 def test_only_the_same_command_is_resumed(
-    tk: Tk, quick: Path, tiny: Path, begun: Path, options: list[str], difference: str
+    tk: Tk, quick: Path, tiny: Path, first_frame: dict[str, Path], tmp_path: Path, options: list[str], difference: str
 ) -> None:
+    begun = Path(shutil.copy(first_frame["volumetric"], tmp_path))
     before = begun.read_bytes()
     ran = tk("track", tiny, "--method", "volumetric", "-o", begun, "--config", quick, "--resume", *options)
     ran.complaint(str(begun), difference, "start again")
@@ -202,13 +203,6 @@ def test_resumed_run_must_read_images_at_the_same_size(copy: Path, tmp_path: Pat
     (copy / "capture.toml").write_text(settings, encoding="utf-8")
     with pytest.raises(ResultError, match="size of the images: 1/2, 1/2, 1/2, 1/2, not full, full, full, full"):
         run(copy, tmp_path / "r.h5", resume=True, config=config)
-
-
-@pytest.fixture(scope="module")
-def begun(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("begun") / "r.h5"
-    run(tiny, path, frames=(0, 1))
-    return path
 
 
 def test_results_of_other_software_are_not_resumed(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:

@@ -50,6 +50,7 @@ def here(*_: object, **__: object) -> Any:
     return nullcontext(SimpleNamespace(submit=submit))
 
 
+@pytest.mark.slow
 def test_benchmark_of_a_small_capture_runs(
     tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -106,6 +107,7 @@ def test_a_capture_that_is_not_there_is_named(tmp_path: Path) -> None:
         main([str(tmp_path / "nowhere"), "--repeat", "1"])
 
 
+@pytest.mark.slow
 def test_the_pieces_of_the_start_are_measured(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main([str(tiny), "--start", "--masks", "auto"])
     lines = [line for line in capsys.readouterr().out.splitlines() if line.strip()]

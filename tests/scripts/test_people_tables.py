@@ -34,6 +34,7 @@ def moved(track: JointTrack, metres: float) -> JointTrack:
     return replace(track, positions=positions, status=np.zeros(len(FRAMES), np.uint8))
 
 
+@pytest.mark.slow
 def test_bystander_scene_is_tracked_and_compared(
     tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -305,32 +305,6 @@ def test_person_is_searched_for_if_the_residual_stays_high(monkeypatch: pytest.M
     assert (tracker.state.residuals.mean - mean).max() < 0.5 * LEAST_SPREAD
 
 
-@pytest.mark.parametrize(
-    ("share", "steps", "state"),
-    [
-        (0.1, 7, {}),
-        (0.9, 7, {}),
-        (1.1, 10, {}),
-        (0.0, 10, {"high_for": 1}),
-        (0.0, 10, {"lost_for": 1}),
-    ],
-)
-def test_scales_follow_from_how_far_the_prediction_may_err(share: float, steps: int, state: dict[str, int]) -> None:
-    """``share``: the error of the prediction, as a share of the second scale's reach."""
-    tracker = tracker_at(POSES[0])
-    tracker.step(observe(MASKS[0]))
-    tracker.solver = replace(tracker.solver, tolerance=0.0)
-    before = tracker.state
-    still = before.alive[0].pose[None]
-    step_px = tracker.line_search.window_px * 2 / abs(1 - tracker.contours.prediction)
-    step_m = step_px / tracker.views.rig.pixels_per_metre(tracker.body.skeleton.joints(still)[0, 0])
-    previous = still.copy()
-    previous[0, 0] -= share * step_m
-    best = replace(before.alive[0], pose=still[0], previous=previous[0])
-    tracker.state = replace(before, alive=[best], **state)
-    assert tracker.step(observe(MASKS[0])).iterations[0] == steps
-
-
 def test_person_is_found_without_a_given_pose() -> None:
     tracker = RegionTracker(RIG, "z", SETTINGS)
     tracker.start([observe(m, i) for i, m in enumerate(MASKS[:3])], Subject(STATURE))
@@ -590,13 +564,6 @@ def test_routine_search_runs_at_intervals() -> None:
     tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=1 / 3))
     searched = [bool(tracker.step(observe(MASKS[0], i)).iterations[1]) for i in range(7)]
     assert np.flatnonzero(searched).tolist() == [0, 5]
-
-
-def test_limb_that_stays_misplaced_is_searched_for_in_every_third_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    tracker = tracker_at(POSES[0], config=RegionSettings(false_alarm=1e-9))  # the residual is never high
-    monkeypatch.setattr(tracker, "misplaced", lambda *_: tracker.limbs[:1])
-    searched = [bool(tracker.step(observe(MASKS[0], i)).iterations[1]) for i in range(7)]
-    assert np.flatnonzero(searched).tolist() == [0, 3, 6]
 
 
 # --- the spread over the modes of a limb ------------------------------------------------------------------------------

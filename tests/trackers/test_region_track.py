@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from tests.conftest import FITTED, FRAMES, QUICK, Silent, Tk, track
+from tests.conftest import FITTED, FRAMES, QUICK, Silent, Tk, as_if_killed, track
 from tests.io.conftest import write_picture
 from tests.run.test_session import send
 from tk.commands.track import EXIT_LOST, _expected_error, end
@@ -97,14 +97,15 @@ def test_the_second_pass_replaces_poses(tiny: Path, causal: Path, refined: Path)
 def test_the_body_is_fitted_again_although_the_recording_begins_in_the_initialisation_pose(
     tiny: Path, fitted: Path, tmp_path: Path
 ) -> None:
-    track(open_capture(tiny), tmp_path / "r.h5", settings_file.from_toml(FITTED), frames=(0, 3))
+    result = as_if_killed(fitted, tmp_path / "r.h5")
+    track(open_capture(tiny), result, settings_file.from_toml(FITTED), frames=(0, 3), resume=True)
     models = [read_result(path).model for path in (fitted, tmp_path / "r.h5")]
     assert np.abs(models[0]["parts/shape"] - models[1]["parts/shape"]).max() > 1e-4
 
 
 def test_another_seed_searches_other_poses_and_finds_the_person_too(tiny: Path, tmp_path: Path) -> None:
     config = settings_file.from_toml(f"seed = 5\n{QUICK}")
-    track(open_capture(tiny), tmp_path / "r.h5", config, frames=(0, 6), causal=True)
+    track(open_capture(tiny), tmp_path / "r.h5", config, frames=(0, 3), causal=True)
     assert mean_error(read_result(tmp_path / "r.h5"), tiny) < 0.08
 
 
@@ -188,11 +189,7 @@ def test_a_run_killed_in_its_second_pass_repeats_it_on_resume(
     tiny: Path, causal: Path, refined: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """All frames are there, and what follows from all of them is not."""
-    result = tmp_path / "r.h5"
-    shutil.copyfile(causal, result)
-    with h5py.File(result, "r+") as file:  # what the end of a causal run adds
-        del file["people/0/smoothed"]
-        del file["cameras"]
+    result = as_if_killed(causal, tmp_path / "r.h5")
     caplog.set_level(logging.INFO, "tk")
     summary = run(tiny, result, resume=True)
     assert (summary.frames, summary.tracked_now) == (FRAMES, 0) and "second pass" in caplog.text
@@ -202,19 +199,6 @@ def test_a_run_killed_in_its_second_pass_repeats_it_on_resume(
     assert run(tiny, result, resume=True).tracked_now == 0
     assert "second pass" not in caplog.text
     assert_same(result, refined)
-
-
-def test_a_result_after_its_second_pass_cannot_be_extended(tk: Tk, tiny: Path, quick: Path, tmp_path: Path) -> None:
-    result = tmp_path / "r.h5"
-    run(tiny, result, frames=(0, 2))
-    before = result.read_bytes()
-    with pytest.raises(ResultError, match=r"a second pass has gone over .* only a causal result"):
-        run(tiny, result, frames=(0, 4), resume=True)
-    assert result.read_bytes() == before
-    # nothing to be done is no mistake, and changes nothing
-    ran = tk("track", tiny, "-o", result, "--config", quick, "--frames", ":2", "--resume")
-    assert ran.code == 0 and "2 of 2 frames are finished already" in ran.err
-    assert result.read_bytes() == before
 
 
 def test_a_causal_result_can_be_extended(tiny: Path, fitted: Path, tmp_path: Path) -> None:
@@ -307,7 +291,7 @@ def test_a_person_who_was_tracked_back_to_front_is_tracked_again(
     errors = []
     for causal in (True, False):
         reporter = Silent()
-        run(tiny, tmp_path / f"{causal}.h5", reporter, causal=causal, frames=(0, 5))
+        run(tiny, tmp_path / f"{causal}.h5", reporter, causal=causal, frames=(0, 3))
         errors.append(mean_error(read_result(tmp_path / f"{causal}.h5"), tiny))
         assert any("faces the other way" in note for note in reporter.notes) != causal
     assert errors[0] > 0.2 and errors[1] < 0.08
@@ -316,15 +300,24 @@ def test_a_person_who_was_tracked_back_to_front_is_tracked_again(
 # --- bodies from files ------------------------------------------------------------------------------------------------
 
 
-def test_the_body_of_an_earlier_result_is_used_unchanged(
-    tiny: Path, causal: Path, refined: Path, tmp_path: Path
+def test_the_body_of_an_earlier_result_is_used_unchanged_and_a_second_pass_ends_a_result(
+    tk: Tk, quick: Path, tiny: Path, refined: Path, tmp_path: Path
 ) -> None:
-    run(tiny, tmp_path / "r.h5", body=refined, frames=(0, 2))
-    found, expected = read_result(tmp_path / "r.h5"), read_result(refined)
+    result = tmp_path / "r.h5"
+    run(tiny, result, body=refined, frames=(0, 2))
+    found, expected = read_result(result), read_result(refined)
     np.testing.assert_array_equal(found.model["parts/shape"], expected.model["parts/shape"])
     np.testing.assert_allclose(found.model["dimensions/thigh"], expected.model["dimensions/thigh"])
     assert found.model[REFINED] == 1, "the second pass settles the frames, and leaves the body"
     assert mean_error(found, tiny) < 0.08
+    before = result.read_bytes()
+    with pytest.raises(ResultError, match=r"a second pass has gone over .* only a causal result"):
+        run(tiny, result, body=refined, frames=(0, 4), resume=True)
+    assert result.read_bytes() == before
+    # nothing to be done is no mistake, and changes nothing
+    ran = tk("track", tiny, "-o", result, "--config", quick, "--body", refined, "--frames", ":2", "--resume")
+    assert ran.code == 0 and "2 of 2 frames are finished already" in ran.err
+    assert result.read_bytes() == before
 
 
 def test_a_body_given_by_dimensions_is_used(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
@@ -377,8 +370,10 @@ def test_results_without_a_cone_body_are_refused(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_run_with_another_body_is_not_resumed(tiny: Path, refined: Path, tmp_path: Path) -> None:
-    run(tiny, tmp_path / "begun.h5", frames=(0, 2), causal=True)
+def test_a_run_with_another_body_is_not_resumed(
+    tiny: Path, refined: Path, first_frame: dict[str, Path], tmp_path: Path
+) -> None:
+    shutil.copy(first_frame["region"], tmp_path / "begun.h5")
     with pytest.raises(ResultError, match=r"given body \(its hash\): none, not "):
         run(tiny, tmp_path / "begun.h5", frames=(0, 4), causal=True, resume=True, body=refined)
 
