@@ -30,8 +30,8 @@ _MOST_SADDLES = 1500
 _RING = 24
 #: share of the ring's variance that two black and two white quarters explain
 _QUARTERS = 0.7
-#: seeds that are tried, and neighbours within this angle of an edge, and this far from their predicted place
-_SEEDS, _CONE_DEG, _OFF = 60, 18.0, 0.3
+#: seeds that are tried; a neighbour is at most this far from its predicted place, share of the distance
+_SEEDS, _OFF = 60, 0.3
 #: pixels a square of the rectified image
 _PX = 16
 #: correlation of the rectified image with the board, that of the markers' bits, and its least lead over another place
