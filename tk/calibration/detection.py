@@ -11,14 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.calibration.boards import APRIL_BORDER, Board
-from tk.calibration.lattice import find_lattice
+from tk.calibration.lattice import FEWEST_POINTS, find_lattice
 
 Float = NDArray[np.float64]
 Ids = NDArray[np.int64]
 Grey = NDArray[np.uint8]
 
-#: fewest points of a view that is used: a pose has six unknowns, and a few points may be wrong
-FEWEST_POINTS = 8
 #: largest root-mean-square distance of a view's points from a plane's image (a homography), as a share of the view's
 #: size. Lenses of action cameras bend a board that fills the image by 0.02; points of another board are off by 0.1.
 _UNPLANAR = 0.05

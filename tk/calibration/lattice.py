@@ -36,8 +36,8 @@ _SEEDS, _OFF = 60, 0.3
 _PX = 16
 #: correlation of the rectified image with the board, that of the markers' bits, and its least lead over another place
 _CORRELATION, _BITS, _LEAD = 0.6, 0.4, 0.15
-#: fewest corners of a lattice
-_FEWEST = 8
+#: fewest points of a view that is used: a pose has six unknowns, and a few points may be wrong
+FEWEST_POINTS = 8
 
 
 def find_lattice(grey: Grey, board: Board) -> tuple[Ids, Float] | None:
@@ -74,7 +74,7 @@ def _find(grey: Grey, board: Board, points: Float, phases: Float) -> tuple[Ids, 
         tried.add(seed)
         lattice = _grow(seed, points, phases, max(board.columns, board.rows))
         tried |= set(lattice.values())
-        if len(lattice) >= _FEWEST:
+        if len(lattice) >= FEWEST_POINTS:
             found = _place(grey, board, {ij: points[k] for ij, k in lattice.items()})
             if found is not None:
                 return found

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
+from tk.io.captures.scene import UP_AGREE_DEG
 from tk.io.paths import replacing
 from tk.io.toml import parse_toml, read_text
 from tk.model.cameras.mounting import FoundUp
@@ -31,8 +32,6 @@ _LONG = 1.6
 _WIDE_M = 0.35
 #: standard deviations of the up direction, degrees: from level cameras, from rolled cameras, from a standing person
 _LEVEL_DEG, _ROLLED_DEG, _LEANING_DEG = 2.0, 8.0, 1.5
-#: if two directions differ more, degrees, they contradict each other
-_AGREE_DEG = 25.0
 #: without a person, cameras that are rolled do not contradict a direction that differs less, degrees
 _UNSURE_DEG = 10.0
 #: percentile of the voxels' heights that is the floor; lower voxels come from specks in the masks
@@ -95,14 +94,14 @@ def _decide(cameras: FoundUp, given: Float, person: Float | None, axes: Sequence
         return given, f"it cannot be decided: {why}", False
     from_given = _degrees(person, given)
     if not cameras.sure:
-        if from_given <= _AGREE_DEG:
+        if from_given <= UP_AGREE_DEG:
             axis = any(np.array_equal(given, up_vector(name)) for name in UP_AXES)
             how = f"as the person stands, {from_given:.0f}° from the capture's; {cameras.how}"
             return (given if axis and from_given <= _UNSURE_DEG else person), how, True
         return given, f"it cannot be decided: the axis of the person differs by {from_given:.0f}°; {cameras.how}", False
     apart = _degrees(person, rough)
-    if apart > _AGREE_DEG:
-        if _degrees(rough, given) <= _AGREE_DEG:
+    if apart > UP_AGREE_DEG:
+        if _degrees(rough, given) <= UP_AGREE_DEG:
             return rough, f"{cameras.how}; the axis of the person, who may lie or sit, differs by {apart:.0f}°", True
         why = f"the cameras are mounted along {shown(cameras.up)}, the person along {shown(up_text(person.round(5)))}"
         return given, f"it cannot be decided: {why}", False
