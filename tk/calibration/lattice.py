@@ -21,9 +21,11 @@ Float = NDArray[np.float64]
 Ids = NDArray[np.int64]
 Grey = NDArray[np.uint8]
 
-#: scales of the search for saddles: smoothing before derivatives, and radius of the ring around a saddle, pixels.
-#: The second one is for squares of less than 16 pixels, the third one for blurred images.
-_SCALES = ((1.0, 3.5), (0.7, 2.3), (0.5, 1.6), (2.0, 6.0))
+#: scales of the search for saddles: smoothing before derivatives, pixels. The second one is for squares of less than 16
+#: pixels, the third one for blurred images.
+SCALES_PX = (1.0, 0.5, 2.0)
+#: radius of the ring around a saddle, as a multiple of the smoothing
+_RING_RADIUS = 3.3
 #: most saddles of an image, the strongest ones; a room has fewer than a thousand
 _MOST_SADDLES = 1500
 #: samples of the ring
@@ -43,8 +45,8 @@ FEWEST_POINTS = 8
 def find_lattice(grey: Grey, board: Board) -> tuple[Ids, Float] | None:
     """Return numbers (N,) and pixels (N, 2) of the board's inner corners; None if the board is not found."""
     best: tuple[Ids, Float] | None = None
-    for smooth_px, ring_px in _SCALES:
-        found = _find(grey, board, *saddles(grey, smooth_px, ring_px))
+    for smooth_px in SCALES_PX:
+        found = _find(grey, board, *saddles(grey, smooth_px))
         if found is not None and (best is None or len(found[0]) > len(best[0])):
             best = found
         if best is not None and len(best[0]) == len(board.points):
@@ -52,16 +54,7 @@ def find_lattice(grey: Grey, board: Board) -> tuple[Ids, Float] | None:
     if best is None:
         return None
     ids, pixels = best[0], _registered(grey, board, *best)
-    ids, pixels = ids[np.isfinite(pixels[:, 0])], pixels[np.isfinite(pixels[:, 0])]
-    if len(ids) < 4:
-        return None
-    points = board.points[ids, :2]
-    onto, _ = cv2.findHomography(points, pixels, cv2.LMEDS)
-    if onto is None:
-        return None
-    off = np.linalg.norm(_through(onto, points) - pixels, axis=1)
-    beside = _through(onto, points + np.array([board.square_m, 0.0])) - _through(onto, points)
-    good = off < _STRAY * np.linalg.norm(beside, axis=1)
+    good = np.isfinite(pixels[:, 0])
     return ids[good], pixels[good]
 
 
@@ -81,8 +74,9 @@ def _find(grey: Grey, board: Board, points: Float, phases: Float) -> tuple[Ids, 
     return None
 
 
-def saddles(grey: Grey, smooth_px: float, ring_px: float) -> tuple[Float, Float]:
+def saddles(grey: Grey, smooth_px: float) -> tuple[Float, Float]:
     """Return saddles (N, 2), strongest first, and the angle (N,) in [0, π) towards which each is bright."""
+    ring_px = _RING_RADIUS * smooth_px
     g = cv2.GaussianBlur(grey, (0, 0), smooth_px).astype(np.float32)
     xx, yy, xy = (cv2.Sobel(g, cv2.CV_32F, *order, ksize=3) for order in ((2, 0), (0, 2), (1, 1)))
     strength = xy * xy - xx * yy
@@ -256,8 +250,6 @@ _STEPS = 6
 #: squares larger than this, pixels, are no plane's image within the window because of the lens; their corners are found
 #: on their own, away from markers
 _LARGE_PX = 64.0
-#: largest distance of a corner from the plane's image, share of a square
-_STRAY = 0.35
 
 
 def _registered(grey: Grey, board: Board, ids: Ids, pixels: Float) -> Float:
@@ -277,7 +269,7 @@ def _registered(grey: Grey, board: Board, ids: Ids, pixels: Float) -> Float:
         )
     side = min(sides)  # the shorter one of a tilted board
     if side > _LARGE_PX:
-        return _sharpened(grey, pixels, side)
+        return sharpened(grey, pixels, side)
     picture = cv2.GaussianBlur(_picture(board, _FINE_PX)[0], (0, 0), _BLUR_PX * _FINE_PX / side)
     window = min(_WINDOW, _WINDOW_PX / side)
     offsets = np.linspace(-window, window, _SAMPLES)
@@ -310,8 +302,9 @@ def _registered(grey: Grey, board: Board, ids: Ids, pixels: Float) -> Float:
     return np.where(lost[:, None], np.nan, found)
 
 
-def _sharpened(grey: Grey, pixels: Float, side: float) -> Float:
-    """Return corners (N, 2) of large squares refined by the directions of edges near them."""
+def sharpened(grey: Grey, pixels: Float, side: float) -> Float:
+    """Return corners (N, 2) of squares, or tags, with sides of so many pixels, refined by the directions of edges near
+    them."""
     half = int(np.clip(0.09 * side, 3, 8))
     done = cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-3
     refined = cv2.cornerSubPix(grey, pixels.astype(np.float32)[:, None].copy(), (half, half), (-1, -1), done)[:, 0]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tk.calibration.boards import KINDS, Board, dictionaries, make_board, resized
 from tk.calibration.detection import detect
 from tk.calibration.footage import Footage
-from tk.calibration.lattice import saddles
+from tk.calibration.lattice import SCALES_PX, saddles
 
 Float = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -53,7 +53,7 @@ def _nearest(samples: Sequence[Grey], board: Board) -> str:
     if samples and all(float(grey.std()) < _FLAT for grey in samples):
         return "the images are of one colour: is the lens covered, or is this the right file?"
     # images with many corners first: they show a board, if any does
-    likely = sorted(samples, key=lambda grey: -len(saddles(grey, 1.0, 3.5)[0]))[:_LIKELY]
+    likely = sorted(samples, key=lambda grey: -len(saddles(grey, SCALES_PX[0])[0]))[:_LIKELY]
     for look in (_mirrored, _other_board, _blurred):
         for grey in likely if look is not _blurred else samples:
             found = look(grey, board)

@@ -14,11 +14,9 @@ from tk.errors import CalibrationError
 
 Float = NDArray[np.float64]
 
-#: largest distance of a board's corners below the floor, metres: a board is bent by some millimetres, a foot of a
-#: tripod may stand lower
-_BELOW_M = 0.04
-#: lowest camera above the floor, metres
-_LOWEST_M = 0.05
+#: largest distance of a board's corners below the floor, and smallest one of a camera above it, metres: a board is bent
+#: by some millimetres, a foot of a tripod may stand lower
+_NEAR_M = 0.05
 #: some board is at least this high, metres; boards that all lie on one table show no floor
 _ABOVE_M = 0.4
 #: median sine of the angle between cameras and the floor, largest; difference that decides nothing
@@ -60,7 +58,7 @@ def place_world(state: State, board: Board, floor: int | None) -> World:
             raise CalibrationError(
                 f"--floor {floor}: no camera finds a sharp board at this instant; the nearest one is {near}"
             )
-        low = [c for c, h in enumerate(_heights(state.boards[floor], state)) if h < _LOWEST_M]
+        low = [c for c, h in enumerate(_heights(state.boards[floor], state)) if h < _NEAR_M]
         if low:
             raise CalibrationError(
                 f"--floor {floor}: {len(low)} of {len(state.cameras)} cameras are below this board; name an instant in "
@@ -87,11 +85,11 @@ def _heights(floor: Pose, state: State) -> Float:
 def _floor_tilt(pose: Pose, state: State, board: Board) -> float | None:
     """Return how far the cameras are from level above a board, the median sine; None if it is no floor: cameras or
     other boards are below it, or nothing is far above it."""
-    if _heights(pose, state).min() < _LOWEST_M:
+    if _heights(pose, state).min() < _NEAR_M:
         return None
     inverse = pose.inverse()
     heights = -np.concatenate([inverse.apply(other.apply(board.corners)) for other in state.boards.values()])[:, 2]
-    if heights.min() < -_BELOW_M or heights.max() < _ABOVE_M:
+    if heights.min() < -_NEAR_M or heights.max() < _ABOVE_M:
         return None
     up = -pose.rotation[:, 2]
     right = np.array([camera.rotation[0] for camera in state.cameras])

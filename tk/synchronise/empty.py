@@ -55,7 +55,7 @@ def find_empty(looks: Sequence[Look], clocks: Clocks) -> tuple[float, float] | N
 def runs(still: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return the indices at which runs of True begin and end, the longest run first."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
-    return sorted(edges.reshape(-1, 2).tolist(), key=lambda run: run[0] - run[1])
+    return sorted(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True), key=lambda run: run[0] - run[1])
 
 
 def _is_empty(look: Look, span: Float) -> bool:

@@ -180,10 +180,8 @@ def read_cameras(folder: Path, recordings: Sequence[Recording]) -> tuple[Calibra
 
 
 def _videos(folder: Path) -> list[Path]:
-    files = [path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES]
-    return sorted(
-        (file for file in files if not file.name.startswith(".")), key=lambda file: natural(file.name.lower())
-    )
+    files = [path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES and path.name[0] != "."]
+    return sorted(files, key=lambda file: natural(file.name.lower()))
 
 
 def _recordings(files: Sequence[Path]) -> Iterator[tuple[Path, ...]]:

@@ -69,7 +69,7 @@ def write_sheet(path: Path, recordings: Sequence[Recording], clocks: Clocks, ins
             name = recording.name.encode("ascii", "replace").decode()
             text = f"{name}  {own:.2f} s of its own" + (f"   common time {at:.2f} s" if c == 0 else "")
             width = _cut(column[0]).shape[1]
-            size = min(0.45, 0.45 * (width - 12) / max(text_width(text, 0.45), 1))
+            size = 0.42 * min(1.0, (width - 12) / max(text_width(text), 1))
             write(head, text, x + 6, _LINE - 9, INK, size)
             x += width
         rows += [head, row]
