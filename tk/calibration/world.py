@@ -19,8 +19,8 @@ Float = NDArray[np.float64]
 _NEAR_M = 0.05
 #: some board is at least this high, metres; boards that all lie on one table show no floor
 _ABOVE_M = 0.4
-#: median sine of the angle between cameras and the floor, largest; difference that decides nothing
-_LEVEL, _SIMILAR = 0.09, 0.02
+#: largest median sine of the angle between cameras and the floor
+_LEVEL = 0.09
 #: z of the world is up, out of the printed side: OpenCV's board has z into the paper
 _FLOOR = Pose(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
 
@@ -68,8 +68,7 @@ def place_world(state: State, board: Board, floor: int | None) -> World:
     tilts = {i: tilt for i, pose in state.boards.items() if (tilt := _floor_tilt(pose, state, board)) is not None}
     if tilts:
         # a tilted board at the edge of the volume may be below all others, too: the cameras are not level above it
-        level = min(tilts.values()) + _SIMILAR
-        first = min(i for i, tilt in tilts.items() if tilt <= level)
+        first = min(tilts, key=lambda i: tilts[i])
         placed = moved(state, _FLOOR @ state.boards[first].inverse())
         return World(placed, first, f"the board of instant {first}, recognised as lying on the floor")
     how = "the cameras' orientation; no board lies on the floor for sure: name one with --floor, or use --level"

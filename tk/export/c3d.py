@@ -26,7 +26,7 @@ _BOTH_BYTES = 257  # the factor that repeats a byte
 _BLOCK = 512  # bytes
 _MOST = np.iinfo(np.uint16).max  # numbers of frames and of blocks
 _MOST_SIGNED = np.iinfo(np.int16).max  # numbers of blocks that all readers take, because some read them as signed
-_MOST_PARAMETERS = 255  # blocks
+_MOST_PARAMETERS = np.iinfo(np.uint8).max  # blocks
 # The first bytes of the header and of the parameters; the last byte means little-endian numbers.
 _HEADER_KEY, _PARAMETER_KEY, _PROCESSOR = b"\2P", b"\1P", 84
 
