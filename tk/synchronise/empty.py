@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.synchronise.looks import DIFFERS, SOMEBODY, Look
+from tk.synchronise.person import GRID_HZ
 from tk.synchronise.ties import Clocks
 
 Float = NDArray[np.float64]
 
 #: least length of the empty part, and what is left off at each end, seconds
 _LEAST_S, _MARGIN_S = 1.5, 0.2
-#: 1/s: of the clock on which motion is compared
-_HZ = 10.0
 #: images with motion that are compared with the still one; share of them that must show the outline
 _SAMPLES, _CLEAR = 24, 0.8
 #: by how much stronger the outline is in the images with motion than in the still one
@@ -32,13 +31,13 @@ def find_empty(looks: Sequence[Look], clocks: Clocks) -> tuple[float, float] | N
     """Return the common time at which the longest empty part begins and ends, seconds; None if none is certain."""
     begin = max(clocks.common(c, float(look.times_s[0])) for c, look in enumerate(looks))
     end = min(clocks.common(c, float(look.times_s[-1])) for c, look in enumerate(looks))
-    clock = np.arange(begin, end, 1 / _HZ)
-    if len(clock) < 2 * _LEAST_S * _HZ:
+    clock = np.arange(begin, end, 1 / GRID_HZ)
+    if len(clock) < 2 * _LEAST_S * GRID_HZ:
         return None
     moving = np.zeros(len(clock), np.bool_)
     for c, look in enumerate(looks):
         at = np.asarray([clocks.common(c, float(time)) for time in look.middles_s])
-        step = np.clip(np.rint((at - begin) * _HZ).astype(int), 0, len(clock) - 1)
+        step = np.clip(np.rint((at - begin) * GRID_HZ).astype(int), 0, len(clock) - 1)
         np.logical_or.at(moving, step, (look.moving > SOMEBODY) & (at > begin - 0.05) & (at < end + 0.05))
     if not moving.any():
         return None
