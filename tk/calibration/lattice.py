@@ -21,11 +21,9 @@ Float = NDArray[np.float64]
 Ids = NDArray[np.int64]
 Grey = NDArray[np.uint8]
 
-#: scales of the search for saddles: smoothing before derivatives, pixels. The second one is for squares of less than 16
-#: pixels, the third one for blurred images.
-SCALES_PX = (1.0, 0.5, 2.0)
-#: radius of the ring around a saddle, as a multiple of the smoothing
-_RING_RADIUS = 3.3
+#: scales of the search for saddles: smoothing before derivatives, and radius of the ring around a saddle, pixels.
+#: The second and third ones are for squares of less than 16 pixels, the last one for blurred images.
+SCALES_PX = ((1.0, 3.5), (0.7, 2.3), (0.5, 1.6), (2.0, 6.0))
 #: most saddles of an image, the strongest ones; a room has fewer than a thousand
 _MOST_SADDLES = 1500
 #: samples of the ring
@@ -45,8 +43,8 @@ FEWEST_POINTS = 8
 def find_lattice(grey: Grey, board: Board) -> tuple[Ids, Float] | None:
     """Return numbers (N,) and pixels (N, 2) of the board's inner corners; None if the board is not found."""
     best: tuple[Ids, Float] | None = None
-    for smooth_px in SCALES_PX:
-        found = _find(grey, board, *saddles(grey, smooth_px))
+    for smooth_px, ring_px in SCALES_PX:
+        found = _find(grey, board, *saddles(grey, smooth_px, ring_px))
         if found is not None and (best is None or len(found[0]) > len(best[0])):
             best = found
         if best is not None and len(best[0]) == len(board.points):
@@ -74,9 +72,8 @@ def _find(grey: Grey, board: Board, points: Float, phases: Float) -> tuple[Ids, 
     return None
 
 
-def saddles(grey: Grey, smooth_px: float) -> tuple[Float, Float]:
+def saddles(grey: Grey, smooth_px: float, ring_px: float) -> tuple[Float, Float]:
     """Return saddles (N, 2), strongest first, and the angle (N,) in [0, π) towards which each is bright."""
-    ring_px = _RING_RADIUS * smooth_px
     g = cv2.GaussianBlur(grey, (0, 0), smooth_px).astype(np.float32)
     xx, yy, xy = (cv2.Sobel(g, cv2.CV_32F, *order, ksize=3) for order in ((2, 0), (0, 2), (1, 1)))
     strength = xy * xy - xx * yy

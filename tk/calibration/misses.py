@@ -53,7 +53,7 @@ def _nearest(samples: Sequence[Grey], board: Board) -> str:
     if samples and all(float(grey.std()) < _FLAT for grey in samples):
         return "the images are of one colour: is the lens covered, or is this the right file?"
     # images with many corners first: they show a board, if any does
-    likely = sorted(samples, key=lambda grey: -len(saddles(grey, SCALES_PX[0])[0]))[:_LIKELY]
+    likely = sorted(samples, key=lambda grey: -len(saddles(grey, *SCALES_PX[0])[0]))[:_LIKELY]
     for look in (_mirrored, _other_board, _blurred):
         for grey in likely if look is not _blurred else samples:
             found = look(grey, board)
