@@ -14,6 +14,7 @@ import pytest
 from tests.io.result_victim import META, make_frame, make_run, make_state
 from tk.io.results.data import ResultMeta, UsedCameras, Value
 from tk.io.results.reader import read_result
+from tk.io.results.revision import Revision, revise_people
 from tk.io.results.schema import checked_row, columns_of
 from tk.io.results.writer import ResultWriter
 from tk.model.body.skeleton import JOINTS
@@ -29,6 +30,19 @@ def append(writer: ResultWriter, *indices: int, state: bool = True, flush: bool 
 def write(path: Path, count: int, meta: ResultMeta = META) -> None:
     with ResultWriter.create(path, meta) as writer:
         append(writer, *range(count))
+
+
+def revise_result(
+    path: Path,
+    columns: Mapping[str, Any] | None = None,
+    *,
+    smoothed: Mapping[str, Any] | None = None,
+    model: Mapping[str, Value] | None = None,
+    person: int = 0,
+    **run: Any,
+) -> ResultMeta:
+    """Replace parts of the result of one person, and ``cameras`` and ``notes`` of the run."""
+    return revise_people(path, {person: Revision(columns or {}, smoothed, model)}, **run)
 
 
 def resume(path: Path, stop: int) -> int:

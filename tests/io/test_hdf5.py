@@ -14,14 +14,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.io.result_files import append, make_cameras, make_smoothed, resume, write_truth
+from tests.io.result_files import append, make_cameras, make_smoothed, resume, revise_result, write_truth
 from tests.io.result_victim import META
 from tk.errors import ResultError, TkError
 from tk.evaluation.joints import evaluate
 from tk.io.hdf5 import MAX_DEPTH, open_hdf5
 from tk.io.results.data import JointTrack
 from tk.io.results.reader import read_joints, read_result
-from tk.io.results.revision import revise_result
 from tk.io.results.writer import ResultWriter
 from tk.model.body.skeleton import JOINTS
 

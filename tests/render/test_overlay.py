@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from tests.conftest import Tk
+from tests.io.result_files import revise_result
 from tests.made_results import write_motion
 from tests.model.figures import draw_silhouettes
 from tk.errors import ResultError
 from tk.io.captures.capture import open_capture
 from tk.io.results.data import UsedCameras
 from tk.io.results.reader import read_joints, read_result
-from tk.io.results.revision import revise_result
 from tk.io.results.status import Status
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import ConeBody, build_cone_body

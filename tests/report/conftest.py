@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from tests.conftest import FRAMES
+from tests.io.result_files import revise_result
 from tests.made_results import write_motion
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.data import JointAngles, Result
 from tk.io.results.reader import read_joints
-from tk.io.results.revision import revise_result
 from tk.io.results.status import Status
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body

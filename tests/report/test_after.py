@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from tests.conftest import QUICK, Silent, Tk, track
+from tests.io.result_files import revise_result
 from tk.errors import ExportError
 from tk.io import settings_file
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.captures.film import Film
 from tk.io.results.data import UsedCameras
 from tk.io.results.reader import read_result
-from tk.io.results.revision import revise_result
 from tk.render.overlay import Overlay
 from tk.render.video import made_here as is_our_video
 from tk.report import after

@@ -22,8 +22,8 @@ Float = NDArray[np.float64]
 _HELD = 1e14
 #: Cauchy's scale in standard deviations: its 95 % efficiency on normal noise
 _CAUCHY = 2.385
-#: iterations, and relative decrease of the cost below which they end; the same while the noise is unknown
-_MOST_ROUNDS, _ENOUGH, _ROUGH = 60, 1e-7, 1e-3
+#: iterations, and relative decrease of the cost below which they end
+_MOST_ROUNDS, _ENOUGH = 60, 1e-7
 #: time between the images of one instant, frames: synchronised videos are within half a frame of each other
 UNSYNCHRONISED = 0.29  # standard deviation of a uniform distribution of that width
 #: least share of a part's information about its focal length that the other unknowns do not explain
@@ -157,7 +157,7 @@ def adjust(start: State, views: Sequence[View], noise_px: float = 1.0) -> Solved
     problem = _Problem(views, tuple(slices), sorted(start.boards))
     state, converged = start, False
     for k in range(4):  # the noise and the estimate depend on each other
-        state, converged = _descend(problem, state, noise_px, _ENOUGH if k else _ROUGH)
+        state, converged = _descend(problem, state, noise_px)
         found = _noise(problem, state)
         settled = k > 0 and abs(found / noise_px - 1) < 0.1
         noise_px = found
@@ -166,7 +166,7 @@ def adjust(start: State, views: Sequence[View], noise_px: float = 1.0) -> Solved
     return Solved(state, noise_px, problem.equations(state, noise_px).reduced(), problem.slices, converged)
 
 
-def _descend(problem: _Problem, state: State, noise_px: float, enough: float) -> tuple[State, bool]:
+def _descend(problem: _Problem, state: State, noise_px: float) -> tuple[State, bool]:
     damping, cost = 1e-3, problem.cost(state, noise_px)
     for _ in range(_MOST_ROUNDS):
         equations = problem.equations(state, noise_px)
@@ -181,7 +181,7 @@ def _descend(problem: _Problem, state: State, noise_px: float, enough: float) ->
             damping *= 8
             if damping > 1e8:
                 return state, True
-        done = cost - new < enough * max(cost, 1e-9)
+        done = cost - new < _ENOUGH * max(cost, 1e-9)
         state, cost, damping = moved, new, max(damping / 8, 1e-9)
         if done:
             return state, True

@@ -11,25 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.calibration.boards import APRIL_BORDER, Board
-from tk.calibration.lattice import find_lattice
+from tk.calibration.lattice import FEWEST_POINTS, find_lattice, sharpened
 
 Float = NDArray[np.float64]
 Ids = NDArray[np.int64]
 Grey = NDArray[np.uint8]
 
-#: fewest points of a view that is used: a pose has six unknowns, and a few points may be wrong
-FEWEST_POINTS = 8
 #: largest root-mean-square distance of a view's points from a plane's image (a homography), as a share of the view's
 #: size. Lenses of action cameras bend a board that fills the image by 0.02; points of another board are off by 0.1.
 _UNPLANAR = 0.05
-#: half the window of the sub-pixel refinement of corners, as a share of the distance between two points, and its bounds
-_WINDOW, _LEAST_WINDOW, _MOST_WINDOW = 0.2, 2, 7
-
-
 #: area of a circle in an image: least, pixels; most, share of the image
 _LEAST_BLOB_PX, _MOST_BLOB = 12, 0.02
-#: share of the corners below which markers are tried, too
-_MOST_SHARE = 0.9
 
 
 @dataclass(frozen=True)
@@ -83,7 +75,7 @@ def _charuco_detector(board: Board) -> Any:
 
 def _charuco(grey: Grey, board: Board) -> tuple[Ids, Float] | None:
     found = find_lattice(grey, board)
-    if found is None or len(found[0]) < _MOST_SHARE * len(board.points):
+    if found is None or len(found[0]) < len(board.points):
         # large squares, or a board that is partly hidden: by its markers
         corners, ids, _, _ = _charuco_detector(board).detectBoard(grey)
         if ids is not None and len(ids) > max(3, 0 if found is None else len(found[0])):
@@ -93,19 +85,13 @@ def _charuco(grey: Grey, board: Board) -> tuple[Ids, Float] | None:
 
 
 def _refined(grey: Grey, board: Board, ids: Ids, pixels: Float) -> Float:
-    """Return corners between black and white quarters, refined with a window that suits their distance."""
+    """Return corners between black and white quarters, refined."""
     onto, _ = cv2.findHomography(board.points[ids, :2], pixels)
     if onto is None:
         return pixels
-    step = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]) * board.square_m * (1 if board.kind != "aprilgrid" else 0.3)
-    around = board.points[ids, None, :2] + step
+    around = board.points[ids, None, :2] + board.square_m * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     seen = cv2.perspectiveTransform(around.reshape(-1, 1, 2), onto).reshape(-1, 3, 2)
-    nearest = np.linalg.norm(seen[:, 1:] - seen[:, :1], axis=2).min()
-    half = int(np.clip(_WINDOW * nearest, _LEAST_WINDOW, _MOST_WINDOW))
-    done = cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-3
-    refined = cv2.cornerSubPix(grey, pixels.astype(np.float32)[:, None].copy(), (half, half), (-1, -1), done)[:, 0]
-    moved = np.linalg.norm(refined - pixels, axis=1) > 2 * half
-    return np.where(moved[:, None], pixels, refined).astype(np.float64)
+    return sharpened(grey, pixels, float(np.linalg.norm(seen[:, 1:] - seen[:, :1], axis=2).min()))
 
 
 def _chessboard(grey: Grey, board: Board) -> tuple[Ids, Float] | None:

@@ -36,8 +36,6 @@ _FASTEST_PX = 8.0
 #: two views of a camera are alike if the mean distance of the board's corners is less than this share of the image's
 #: width
 _ALIKE = 0.015
-#: distance of views, share of the image's width, that gains nothing more
-_FAR = 0.3
 #: images kept for the explanation if no board is found, and width of the pictures of the report, pixels
 _SAMPLES, _THUMB_PX = 24, 420
 #: fewest views of a camera: two determine a focal length only in theory
@@ -254,7 +252,7 @@ def choose(footages: Sequence[Footage], most: int, always: int | None = None) ->
         if blurred or moving:
             left_out.append(f"camera {footage.name}: {blurred} blurred and {moving} fast views are not used")
     width = [max(footage.width, 1) for footage in footages]
-    nearest = {(c, i): _FAR for i, cameras in usable.items() for c in cameras}
+    nearest = {(c, i): np.inf for i, cameras in usable.items() for c in cameras}
     chosen: dict[int, list[int]] = {}
     while usable and len(chosen) < most:
         weight = {i: (2 if len(cameras) > 1 else 1) for i, cameras in usable.items()}

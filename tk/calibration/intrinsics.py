@@ -16,8 +16,8 @@ Float = NDArray[np.float64]
 
 #: focal lengths to begin with, as shares of the image's width: 115° to 16° of view
 _FOCALS = np.geomspace(0.32, 3.5, 15)
-#: views for the first focal length, and for a fit of one camera; more change little
-_FIRST_VIEWS, _MOST_VIEWS = 10, 36
+#: views for a fit of one camera; more change little
+_MOST_VIEWS = 36
 #: parts of the views, each held out once
 _FOLDS = 3
 #: another model than the first must lower the error in held-out views by this share
@@ -61,7 +61,8 @@ def fit_lens(views: Sequence[View], size: tuple[int, int], models: Sequence[Mode
         poses = board_poses(given, views)
         near, far = _range(poses, views)
         return Fitted(given, poses, {}, near, far, "given")
-    views = _spread(views, _MOST_VIEWS)
+    if len(views) > _MOST_VIEWS:
+        views = [views[int(k)] for k in np.linspace(0, len(views) - 1, _MOST_VIEWS)]
     fits = {model.name: _fit(_first(model, views, size), views) for model in models}
     errors: dict[str, float] = {}
     best = models[0]
@@ -82,23 +83,15 @@ def fit_lens(views: Sequence[View], size: tuple[int, int], models: Sequence[Mode
     return Fitted(lens, poses, errors, near, far, "free")
 
 
-def _spread(views: Sequence[View], most: int) -> list[View]:
-    """Return at most this many views, evenly over the list."""
-    if len(views) <= most:
-        return list(views)
-    return [views[int(i)] for i in np.linspace(0, len(views) - 1, most)]
-
-
 def _first(model: Model, views: Sequence[View], size: tuple[int, int]) -> Lens:
     """Return a lens without distortion whose focal length fits best, of :data:`_FOCALS`."""
     width, height = size
     middle = [(width - 1) / 2, (height - 1) / 2]
-    some = _spread(sorted(views, key=lambda view: -len(view.points)), _FIRST_VIEWS)
     candidates = []
     for share in _FOCALS:
         values = np.array([share * width] * 2 + middle + [0.0] * (model.size - 4))
         errors = []
-        for view in some:
+        for view in views:
             found = planar_poses(view.points, undistort(model, values, view.pixels), refine=False)
             errors.append(found[0][0] * values[0] if found else 1e3)
         candidates.append((float(np.median(errors)), values))

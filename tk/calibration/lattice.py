@@ -22,28 +22,28 @@ Ids = NDArray[np.int64]
 Grey = NDArray[np.uint8]
 
 #: scales of the search for saddles: smoothing before derivatives, and radius of the ring around a saddle, pixels.
-#: The second one is for squares of less than 16 pixels, the third one for blurred images.
-_SCALES = ((1.0, 3.5), (0.7, 2.3), (0.5, 1.6), (2.0, 6.0))
+#: The second and third ones are for squares of less than 16 pixels, the last one for blurred images.
+SCALES_PX = ((1.0, 3.5), (0.7, 2.3), (0.5, 1.6), (2.0, 6.0))
 #: most saddles of an image, the strongest ones; a room has fewer than a thousand
 _MOST_SADDLES = 1500
 #: samples of the ring
 _RING = 24
 #: share of the ring's variance that two black and two white quarters explain
 _QUARTERS = 0.7
-#: seeds that are tried, and neighbours within this angle of an edge, and this far from their predicted place
-_SEEDS, _CONE_DEG, _OFF = 60, 18.0, 0.3
+#: seeds that are tried; a neighbour is at most this far from its predicted place, share of the distance
+_SEEDS, _OFF = 60, 0.3
 #: pixels a square of the rectified image
 _PX = 16
 #: correlation of the rectified image with the board, that of the markers' bits, and its least lead over another place
 _CORRELATION, _BITS, _LEAD = 0.6, 0.4, 0.15
-#: fewest corners of a lattice
-_FEWEST = 8
+#: fewest points of a view that is used: a pose has six unknowns, and a few points may be wrong
+FEWEST_POINTS = 8
 
 
 def find_lattice(grey: Grey, board: Board) -> tuple[Ids, Float] | None:
     """Return numbers (N,) and pixels (N, 2) of the board's inner corners; None if the board is not found."""
     best: tuple[Ids, Float] | None = None
-    for smooth_px, ring_px in _SCALES:
+    for smooth_px, ring_px in SCALES_PX:
         found = _find(grey, board, *saddles(grey, smooth_px, ring_px))
         if found is not None and (best is None or len(found[0]) > len(best[0])):
             best = found
@@ -52,16 +52,7 @@ def find_lattice(grey: Grey, board: Board) -> tuple[Ids, Float] | None:
     if best is None:
         return None
     ids, pixels = best[0], _registered(grey, board, *best)
-    ids, pixels = ids[np.isfinite(pixels[:, 0])], pixels[np.isfinite(pixels[:, 0])]
-    if len(ids) < 4:
-        return None
-    points = board.points[ids, :2]
-    onto, _ = cv2.findHomography(points, pixels, cv2.LMEDS)
-    if onto is None:
-        return None
-    off = np.linalg.norm(_through(onto, points) - pixels, axis=1)
-    beside = _through(onto, points + np.array([board.square_m, 0.0])) - _through(onto, points)
-    good = off < _STRAY * np.linalg.norm(beside, axis=1)
+    good = np.isfinite(pixels[:, 0])
     return ids[good], pixels[good]
 
 
@@ -74,7 +65,7 @@ def _find(grey: Grey, board: Board, points: Float, phases: Float) -> tuple[Ids, 
         tried.add(seed)
         lattice = _grow(seed, points, phases, max(board.columns, board.rows))
         tried |= set(lattice.values())
-        if len(lattice) >= _FEWEST:
+        if len(lattice) >= FEWEST_POINTS:
             found = _place(grey, board, {ij: points[k] for ij, k in lattice.items()})
             if found is not None:
                 return found
@@ -256,8 +247,6 @@ _STEPS = 6
 #: squares larger than this, pixels, are no plane's image within the window because of the lens; their corners are found
 #: on their own, away from markers
 _LARGE_PX = 64.0
-#: largest distance of a corner from the plane's image, share of a square
-_STRAY = 0.35
 
 
 def _registered(grey: Grey, board: Board, ids: Ids, pixels: Float) -> Float:
@@ -277,7 +266,7 @@ def _registered(grey: Grey, board: Board, ids: Ids, pixels: Float) -> Float:
         )
     side = min(sides)  # the shorter one of a tilted board
     if side > _LARGE_PX:
-        return _sharpened(grey, pixels, side)
+        return sharpened(grey, pixels, side)
     picture = cv2.GaussianBlur(_picture(board, _FINE_PX)[0], (0, 0), _BLUR_PX * _FINE_PX / side)
     window = min(_WINDOW, _WINDOW_PX / side)
     offsets = np.linspace(-window, window, _SAMPLES)
@@ -310,8 +299,9 @@ def _registered(grey: Grey, board: Board, ids: Ids, pixels: Float) -> Float:
     return np.where(lost[:, None], np.nan, found)
 
 
-def _sharpened(grey: Grey, pixels: Float, side: float) -> Float:
-    """Return corners (N, 2) of large squares refined by the directions of edges near them."""
+def sharpened(grey: Grey, pixels: Float, side: float) -> Float:
+    """Return corners (N, 2) of squares, or tags, with sides of so many pixels, refined by the directions of edges near
+    them."""
     half = int(np.clip(0.09 * side, 3, 8))
     done = cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-3
     refined = cv2.cornerSubPix(grey, pixels.astype(np.float32)[:, None].copy(), (half, half), (-1, -1), done)[:, 0]

@@ -1,4 +1,4 @@
-"""Lens models with analytic derivatives. Intrinsics are one vector: fx, fy, cx, cy, then the distortion.
+"""Lens models. Intrinsics are one vector: fx, fy, cx, cy, then the distortion.
 
 The distortion is in OpenCV's order: k1 k2 p1 p2 k3 (pinhole5), with k4 k5 k6 (pinhole8), or k1 to k4 (fisheye).
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,7 +24,6 @@ class Model:
 
     name: str
     names: tuple[str, ...]  # names of the distortion's numbers
-    sigmas: tuple[float, ...]  # standard deviations of the distortion's numbers about 0
     fisheye: bool = False
 
     @property
@@ -31,10 +31,15 @@ class Model:
         """Number of intrinsics."""
         return 4 + len(self.names)
 
+    @property
+    def sigmas(self) -> Float:
+        """(D,) standard deviations of the distortion's numbers about 0."""
+        return np.array([TANGENTIAL_SIGMA if name.startswith("p") else RADIAL_SIGMA for name in self.names])
 
-PINHOLE5 = Model("pinhole5", ("k1", "k2", "p1", "p2", "k3"), (0.5, 0.5, 0.005, 0.005, 0.3))
-PINHOLE8 = Model("pinhole8", (*PINHOLE5.names, "k4", "k5", "k6"), (*PINHOLE5.sigmas, 0.5, 0.3, 0.2))
-FISHEYE = Model("fisheye", ("k1", "k2", "k3", "k4"), (0.2, 0.2, 0.1, 0.1), fisheye=True)
+
+PINHOLE5 = Model("pinhole5", ("k1", "k2", "p1", "p2", "k3"))
+PINHOLE8 = Model("pinhole8", (*PINHOLE5.names, "k4", "k5", "k6"))
+FISHEYE = Model("fisheye", ("k1", "k2", "k3", "k4"), fisheye=True)
 
 #: models to choose from, the one with fewer numbers first: a later one must fit clearly better
 CHOICE = (PINHOLE5, FISHEYE, PINHOLE8)
@@ -44,51 +49,8 @@ MODELS = {model.name: model for model in CHOICE}
 #: image's width. Pixels are square in all common cameras; a principal point lies within 3 % of the centre, except in
 #: cropped images.
 FOCAL_SIGMA, ASPECT_SIGMA, MIDDLE_SIGMA = 0.5, 0.002, 0.02
-
-
-def distort(model: Model, xy: Float, d: Float) -> tuple[Float, Float, Float]:
-    """Return distorted coordinates (N, 2) of normalised ones (N, 2), and their derivatives by both inputs.
-
-    Returns:
-        uv (N, 2), duv/dxy (N, 2, 2), duv/dd (N, 2, D).
-    """
-    x, y = xy.T
-    q = x * x + y * y
-    if model.fisheye:
-        return _distort_fisheye(x, y, q, d)
-    k1, k2, p1, p2, k3 = d[:5]
-    k4, k5, k6 = d[5:8] if len(d) > 5 else np.zeros(3)
-    top, bottom = 1 + q * (k1 + q * (k2 + q * k3)), 1 + q * (k4 + q * (k5 + q * k6))
-    L = top / bottom
-    dL = (k1 + q * (2 * k2 + 3 * k3 * q) - L * (k4 + q * (2 * k5 + 3 * k6 * q))) / bottom
-    uv = np.stack([x * L + 2 * p1 * x * y + p2 * (q + 2 * x * x), y * L + p1 * (q + 2 * y * y) + 2 * p2 * x * y], 1)
-    across = 2 * x * y * dL + 2 * p1 * x + 2 * p2 * y
-    by_xy = np.empty((len(x), 2, 2))
-    by_xy[:, 0, 0] = L + 2 * x * x * dL + 2 * p1 * y + 6 * p2 * x
-    by_xy[:, 0, 1] = by_xy[:, 1, 0] = across
-    by_xy[:, 1, 1] = L + 2 * y * y * dL + 6 * p1 * y + 2 * p2 * x
-    by_d = np.empty((len(x), 2, len(d)))
-    for column, power in ((0, 1), (1, 2), (4, 3)):
-        by_d[:, :, column] = xy * (q**power / bottom)[:, None]
-    for column, power in ((5, 1), (6, 2), (7, 3)) if len(d) > 5 else ():
-        by_d[:, :, column] = -xy * (L * q**power / bottom)[:, None]
-    by_d[:, 0, 2], by_d[:, 1, 2] = 2 * x * y, q + 2 * y * y
-    by_d[:, 0, 3], by_d[:, 1, 3] = q + 2 * x * x, 2 * x * y
-    return uv, by_xy, by_d
-
-
-def _distort_fisheye(x: Float, y: Float, q: Float, d: Float) -> tuple[Float, Float, Float]:
-    r = np.sqrt(np.maximum(q, 1e-16))
-    angle = np.arctan(r)
-    s = angle * angle
-    bent = angle * (1 + s * (d[0] + s * (d[1] + s * (d[2] + s * d[3]))))
-    slope = 1 + s * (3 * d[0] + s * (5 * d[1] + s * (7 * d[2] + 9 * s * d[3])))
-    scale = bent / r
-    growth = (slope / (1 + q) - scale) / r  # of the scale, by r
-    xy = np.stack([x, y], axis=1)
-    by_xy = scale[:, None, None] * np.eye(2) + (growth / r)[:, None, None] * xy[:, :, None] * xy[:, None, :]
-    powers = angle[:, None] ** np.array([3, 5, 7, 9]) / r[:, None]
-    return xy * scale[:, None], by_xy, xy[:, :, None] * powers[:, None, :]
+#: standard deviations of the priors of the distortion's numbers k and p
+RADIAL_SIGMA, TANGENTIAL_SIGMA = 0.5, 0.005
 
 
 def project(model: Model, lens: Float, p_camera: Float) -> tuple[Float, Float, Float]:
@@ -97,29 +59,32 @@ def project(model: Model, lens: Float, p_camera: Float) -> tuple[Float, Float, F
     Returns:
         pixels (N, 2), by the points (N, 2, 3), by the intrinsics (N, 2, K).
     """
-    z = np.maximum(p_camera[:, 2], 1e-6)
-    xy = p_camera[:, :2] / z[:, None]
-    uv, by_xy, by_d = distort(model, xy, lens[4:])
-    focal = lens[:2]
-    by_point = np.empty((len(z), 2, 3))
-    by_point[:, :, :2] = by_xy / z[:, None, None]
-    by_point[:, :, 2] = -np.einsum("nij,nj->ni", by_xy, xy) / z[:, None]
-    by_lens = np.zeros((len(z), 2, model.size))
-    by_lens[:, 0, 0], by_lens[:, 1, 1] = uv.T
-    by_lens[:, 0, 2] = by_lens[:, 1, 3] = 1.0
-    by_lens[:, :, 4:] = by_d * focal[:, None]
-    return uv * focal + lens[2:4], by_point * focal[:, None], by_lens
+    points = np.column_stack([p_camera[:, :2], np.maximum(p_camera[:, 2], 1e-6)])[:, None]
+    matrix, zero = np.array([[lens[0], 0, lens[2]], [0, lens[1], lens[3]], [0, 0, 1]]), np.zeros(3)
+    if model.fisheye:
+        pixels, by_all = cv2.fisheye.projectPoints(points, zero, zero, matrix, lens[4:])
+        by_lens, _, by_point, _ = np.split(by_all, [model.size, model.size + 3, model.size + 6], axis=1)
+    else:
+        pixels, by_all = cv2.projectPoints(points, zero, zero, matrix, lens[4:])
+        _, by_point, by_lens = np.split(by_all, [3, 6], axis=1)
+    return (
+        np.asarray(pixels[:, 0], np.float64),
+        np.asarray(by_point, np.float64).reshape(-1, 2, 3),
+        np.asarray(by_lens, np.float64).reshape(-1, 2, model.size),
+    )
 
 
 def undistort(model: Model, lens: Float, pixels: Float) -> Float:
     """Return normalised coordinates (N, 2) of pixels (N, 2), by Newton's method; clipped where the model folds."""
     uv = (pixels - lens[2:4]) / lens[:2]
+    unit = np.concatenate([[1.0, 1.0, 0.0, 0.0], lens[4:]])  # a lens whose pixels are distorted coordinates
     xy = uv.copy()
     if model.fisheye:
         angle = np.minimum(np.linalg.norm(uv, axis=1, keepdims=True), 1.5)
         xy = uv * np.tan(angle) / np.maximum(angle, 1e-9)
     for _ in range(12):
-        now, by_xy, _ = distort(model, xy, lens[4:])
+        now, by_point, _ = project(model, unit, np.column_stack([xy, np.ones(len(xy))]))
+        by_xy = by_point[:, :, :2]
         if not np.isfinite(by_xy).all():
             break
         with np.errstate(all="ignore"):

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.calibration.boards import KINDS, Board, dictionaries, resized
+from tk.calibration.boards import KINDS, Board, dictionaries, make_board, resized
 from tk.calibration.detection import detect
 from tk.calibration.footage import Footage
-from tk.calibration.lattice import saddles
+from tk.calibration.lattice import SCALES_PX, saddles
 
 Float = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -27,8 +27,6 @@ _LIKELY = 4
 _SIZES = range(3, 15)
 #: mean distance of markers from their places on a board of the right size, share of a marker's side
 _FITS = 0.25
-#: images are searched at these shares of their size: blur disappears
-_SHRUNK = (0.5, 0.25, 0.125)
 #: boards with markers
 _MARKED = ("charuco", "aprilgrid")
 
@@ -55,7 +53,7 @@ def _nearest(samples: Sequence[Grey], board: Board) -> str:
     if samples and all(float(grey.std()) < _FLAT for grey in samples):
         return "the images are of one colour: is the lens covered, or is this the right file?"
     # images with many corners first: they show a board, if any does
-    likely = sorted(samples, key=lambda grey: -len(saddles(grey, 1.0, 3.5)[0]))[:_LIKELY]
+    likely = sorted(samples, key=lambda grey: -len(saddles(grey, *SCALES_PX[0])[0]))[:_LIKELY]
     for look in (_mirrored, _other_board, _blurred):
         for grey in likely if look is not _blurred else samples:
             found = look(grey, board)
@@ -80,7 +78,7 @@ def _mirrored(grey: Grey, board: Board) -> str | None:
 
 
 def _blurred(grey: Grey, board: Board) -> str | None:
-    for share in _SHRUNK:
+    for share in 0.5 ** np.arange(1, 4):  # smaller images are less blurred
         small = cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
         if detect(np.asarray(small, np.uint8), board) is not None:
             return (
@@ -174,8 +172,4 @@ def _other_patterns(board: Board) -> Iterator[Board]:
                 yield resized(board, board.columns + columns, board.rows + rows)
     if board.kind in ("chessboard", "circles"):
         yield resized(board, board.rows, board.columns)
-    for kind, (columns, rows) in KINDS.items():
-        if kind != board.kind:
-            april = kind == "aprilgrid"
-            name, marker = ("apriltag_36h11", 0.3) if april else ("4x4_50", 0.75)
-            yield replace(board, kind=kind, columns=columns, rows=rows, dictionary=name, marker=marker)
+    yield from (make_board(kind, None, board.square_m) for kind in KINDS if kind != board.kind)

@@ -23,8 +23,6 @@ Float = NDArray[np.float64]
 
 #: a view contradicts the others if its median error exceeds this many standard deviations, and this many pixels
 _CONTRADICTS, _CONTRADICTS_PX = 5.0, 0.7
-#: most rounds in which contradicting views are removed
-_ROUNDS = 4
 #: images of two cameras in which the board is less apart are copies, pixels: encoding again moves points by less
 _COPY_PX = 1.0
 #: default for the largest number of instants
@@ -208,7 +206,7 @@ def _adjust(state: State, views: Sequence[View]) -> tuple[Solved, list[View], li
     """Adjust the estimate, without views that contradict the others."""
     kept, dropped = list(views), list[View]()
     solved = adjust(state, kept, noise_px=0.5)
-    for _ in range(_ROUNDS):
+    while True:
         # of one instant the worst view only: it may have moved the board of the others
         worst: dict[int, tuple[float, View]] = {}
         for view in kept:
@@ -218,14 +216,13 @@ def _adjust(state: State, views: Sequence[View]) -> tuple[Solved, list[View], li
             if error > limit and error > worst.get(view.instant, (0.0, view))[0]:
                 worst[view.instant] = error, view
         if not worst:
-            break
+            return solved, kept, dropped
         bad = {id(view) for _, view in worst.values()}
         dropped += [view for view in kept if id(view) in bad]
         kept = [view for view in kept if id(view) not in bad]
         instants = {view.instant for view in kept}
         boards = {i: pose for i, pose in solved.state.boards.items() if i in instants}
         solved = adjust(replace(solved.state, boards=boards), kept, solved.noise_px)
-    return solved, kept, dropped
 
 
 def _check_still_connected(names: Sequence[str], kept: Sequence[View], dropped: Sequence[View]) -> None:

@@ -9,8 +9,17 @@ from tk.calibration.boards import Board, make_board
 from tk.errors import ConfigError
 from tk.io.paths import Kind, check_output, looks_like, replacing
 
+
+def _papers() -> dict[str, tuple[int, int]]:
+    """Return width and height of sheets of paper held across, millimetres: each is half of the one before."""
+    sides = [1189, 841]
+    while len(sides) < 6:
+        sides.append(sides[-2] // 2)
+    return {f"A{n}": (sides[n], sides[n + 1]) for n in range(5)}
+
+
 #: width and height of a sheet of paper held across, millimetres
-PAPERS = {"A4": (297, 210), "A3": (420, 297), "A2": (594, 420), "A1": (841, 594), "A0": (1189, 841)}
+PAPERS = _papers()
 #: edge that printers leave white, and room for the text below the board, millimetres
 _EDGE_MM, _TEXT_MM = 8.0, 14.0
 #: PostScript points in a millimetre

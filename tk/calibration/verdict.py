@@ -42,8 +42,8 @@ _NEAR_M = 0.6
 CELLS = (8, 6)
 #: an intrinsic is determined by the data if its standard deviation is below this share of its prior's
 _DETERMINED = 0.5
-#: half the sides of the space of a person, metres, where the cameras give no smaller one
-_PERSON_M = np.array([1.0, 1.0, 1.0])
+#: half the side of the space of a person, metres, where the cameras give no smaller one
+_PERSON_M = 1.0
 
 
 @dataclass(frozen=True)

@@ -14,15 +14,13 @@ from tk.errors import CalibrationError
 
 Float = NDArray[np.float64]
 
-#: largest distance of a board's corners below the floor, metres: a board is bent by some millimetres, a foot of a
-#: tripod may stand lower
-_BELOW_M = 0.04
-#: lowest camera above the floor, metres
-_LOWEST_M = 0.05
+#: largest distance of a board's corners below the floor, and smallest one of a camera above it, metres: a board is bent
+#: by some millimetres, a foot of a tripod may stand lower
+_NEAR_M = 0.05
 #: some board is at least this high, metres; boards that all lie on one table show no floor
 _ABOVE_M = 0.4
-#: median sine of the angle between cameras and the floor, largest; difference that decides nothing
-_LEVEL, _SIMILAR = 0.09, 0.02
+#: largest median sine of the angle between cameras and the floor
+_LEVEL = 0.09
 #: z of the world is up, out of the printed side: OpenCV's board has z into the paper
 _FLOOR = Pose(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
 
@@ -60,7 +58,7 @@ def place_world(state: State, board: Board, floor: int | None) -> World:
             raise CalibrationError(
                 f"--floor {floor}: no camera finds a sharp board at this instant; the nearest one is {near}"
             )
-        low = [c for c, h in enumerate(_heights(state.boards[floor], state)) if h < _LOWEST_M]
+        low = [c for c, h in enumerate(_heights(state.boards[floor], state)) if h < _NEAR_M]
         if low:
             raise CalibrationError(
                 f"--floor {floor}: {len(low)} of {len(state.cameras)} cameras are below this board; name an instant in "
@@ -70,8 +68,7 @@ def place_world(state: State, board: Board, floor: int | None) -> World:
     tilts = {i: tilt for i, pose in state.boards.items() if (tilt := _floor_tilt(pose, state, board)) is not None}
     if tilts:
         # a tilted board at the edge of the volume may be below all others, too: the cameras are not level above it
-        level = min(tilts.values()) + _SIMILAR
-        first = min(i for i, tilt in tilts.items() if tilt <= level)
+        first = min(tilts, key=lambda i: tilts[i])
         placed = moved(state, _FLOOR @ state.boards[first].inverse())
         return World(placed, first, f"the board of instant {first}, recognised as lying on the floor")
     how = "the cameras' orientation; no board lies on the floor for sure: name one with --floor, or use --level"
@@ -87,11 +84,11 @@ def _heights(floor: Pose, state: State) -> Float:
 def _floor_tilt(pose: Pose, state: State, board: Board) -> float | None:
     """Return how far the cameras are from level above a board, the median sine; None if it is no floor: cameras or
     other boards are below it, or nothing is far above it."""
-    if _heights(pose, state).min() < _LOWEST_M:
+    if _heights(pose, state).min() < _NEAR_M:
         return None
     inverse = pose.inverse()
     heights = -np.concatenate([inverse.apply(other.apply(board.corners)) for other in state.boards.values()])[:, 2]
-    if heights.min() < -_BELOW_M or heights.max() < _ABOVE_M:
+    if heights.min() < -_NEAR_M or heights.max() < _ABOVE_M:
         return None
     up = -pose.rotation[:, 2]
     right = np.array([camera.rotation[0] for camera in state.cameras])

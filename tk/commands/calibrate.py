@@ -43,10 +43,7 @@ _OF_WAY = {
 )
 @click.option("--size", metavar="7x5", help="Columns and rows of squares, circles or tags.  [default: that of --print]")
 @click.option(
-    "--marker",
-    type=float,
-    metavar="SHARE",
-    help="Marker's side, of a square's; aprilgrid: gap.  [0.75; 0.3]",
+    "--marker", type=float, metavar="SHARE", help="Marker's side, of a square's; aprilgrid: gap.  [0.75; 0.3]"
 )
 @click.option("--dictionary", metavar="NAME", help="Markers of the board.  [default: 4x4_50; apriltag_36h11]")
 @click.option(
@@ -54,10 +51,7 @@ _OF_WAY = {
 )
 @click.option("--instants", type=click.IntRange(3), metavar="N", help="Use N instants at most.  [default: 120]")
 @click.option(
-    "--floor",
-    type=int,
-    metavar="N",
-    help="Instant in which the board lies on the floor.  [default: recognised]",
+    "--floor", type=int, metavar="N", help="Instant in which the board lies on the floor.  [default: recognised]"
 )
 @click.option("--intrinsics", type=base.PATH, metavar="FILE", help="Take the intrinsics from an earlier calibration.")
 @click.option("--report", "page", type=base.PATH, metavar="PAGE.html", help="Page.  [default: next to the calibration]")

@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger("tk")
 
-#: longest silence and seconds between two lines of progress of one capture, and of a batch, if stderr is no terminal.
-#: The values only decide how many lines a log file gets.
-_PERIOD_S, _BATCH_PERIOD_S = 2.0, 5.0
+#: longest silence and seconds between two lines of progress if stderr is no terminal. It only decides how many lines a
+#: log file gets.
+_PERIOD_S = 2.0
 #: captures named in a batch's line of progress; more would not fit on a line
 _NAMED_CAPTURES = 4
 
@@ -239,7 +239,7 @@ class BatchConsoleReporter(_Notes):
         """Show how many frames of a capture are finished."""
         self._running[name] = (done, total)
         self._update(description=self._running_captures())
-        if not self._bars and not self._quiet and time.monotonic() - self._last > _BATCH_PERIOD_S:
+        if not self._bars and not self._quiet and time.monotonic() - self._last > _PERIOD_S:
             self._last = time.monotonic()
             self._console.print(self._running_captures(), markup=False)
 

@@ -30,8 +30,8 @@ _FPS, CLAPS_S, BOARDS_S, HELD_S, EMPTY_S, PERSON_S, _END_S = 15.0, (4.0, 36.0), 
 # camera stands on its side.
 _STARTS_S = (0.0, 1.4, 3.2, 0.8, 2.6)
 _TICKS, _VARIABLE, _ON_ITS_SIDE = 30000, 2, 3
-# Sound: samples a second, speed in air, m/s, time in which a clap fades, s; and where the hands clap, metres.
-_RATE, _SOUND_M_S, _FADES_S, _HANDS = 48000, 343.0, 0.02, np.array([0.0, 0.0, 1.2])
+# Sound: samples a second, time in which a clap fades, s; and where the hands clap, metres.
+_RATE, _FADES_S, _HANDS = 48000, 0.02, np.array([0.0, 0.0, 1.2])
 
 Images = list[NDArray[np.uint8]]
 
@@ -128,13 +128,15 @@ def _write(path: Path, images: Iterator[NDArray[np.uint8]], times: NDArray[np.fl
 
 def _sound(start_s: float, c: int, away_m: float) -> NDArray[np.float32]:
     """Return what a microphone records from a time on: claps with an echo, and its own noise."""
+    from tk.synchronise.travel import SOUND_M_S
+
     claps = np.random.default_rng(100)  # the same for all
     samples = np.zeros(round((_END_S - start_s) * _RATE))
     fades = np.exp(-np.arange(round(8 * _FADES_S * _RATE)) / (_FADES_S * _RATE))
     for clap_s in CLAPS_S:
         ring = claps.normal(size=len(fades)) * fades
         for delay_s, strength in ((0.0, 0.5), (0.011 + 0.002 * c, 0.15)):
-            first = round((clap_s + delay_s + away_m / _SOUND_M_S - start_s) * _RATE)
+            first = round((clap_s + delay_s + away_m / SOUND_M_S - start_s) * _RATE)
             samples[first : first + len(ring)] += strength * ring / away_m
     own = np.random.default_rng(c)
     return np.clip(samples + own.normal(scale=0.003, size=len(samples)), -1.0, 1.0).astype(np.float32)

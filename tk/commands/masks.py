@@ -18,12 +18,7 @@ from tk.commands.console import ConsoleReporter
 @base.frames_option
 @base.quiet_option
 def masks(
-    capture: Path,
-    output: Path,
-    segmenter: str | None,
-    cameras: base.Names,
-    frames: base.Span,
-    quiet: bool,
+    capture: Path, output: Path, segmenter: str | None, cameras: base.Names, frames: base.Span, quiet: bool
 ) -> None:
     """Segment the videos of CAPTURE with a neural network and write masks to DIR/CAMERA/000000.png.
 

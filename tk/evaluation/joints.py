@@ -196,10 +196,7 @@ def evaluate(result: JointTrack, truth: JointTrack) -> Evaluation:
     in_trunk = np.einsum("fki,fjk->fji", axes, difference)
     offsets = _median_where_finite(in_trunk[~lost])  # (J, 3)
     known_trunk = known & np.isfinite(axes.sum(axis=(1, 2)))[:, None]
-    distances = {
-        "raw": _distances(difference, known),
-        "corrected": _distances(in_trunk - offsets, known_trunk),
-    }
+    distances = {"raw": _distances(difference, known), "corrected": _distances(in_trunk - offsets, known_trunk)}
     limbs = [JOINTS.index(name) for name in LIMB_JOINTS]
     sigma: Float | None = None
     if result.sigma is not None:

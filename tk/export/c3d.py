@@ -22,13 +22,13 @@ import numpy as np
 from tk.export.motion import Motion
 from tk.model.body.joints import SEGMENT_ORIGIN
 
-_MOST_RESIDUAL, _BOTH_BYTES = 127, 257  # a signed byte; the factor that repeats it
+_BOTH_BYTES = 257  # the factor that repeats a byte
 _BLOCK = 512  # bytes
-_MOST = 65535  # of 16 bits: numbers of frames and of blocks
-_MOST_SIGNED = 32767  # numbers of blocks that all readers take, because some read them as signed
-_MOST_PARAMETERS = 255  # blocks
+_MOST = np.iinfo(np.uint16).max  # numbers of frames and of blocks
+_MOST_SIGNED = np.iinfo(np.int16).max  # numbers of blocks that all readers take, because some read them as signed
+_MOST_PARAMETERS = np.iinfo(np.uint8).max  # blocks
 # The first bytes of the header and of the parameters; the last byte means little-endian numbers.
-_HEADER_KEY, _PARAMETER_KEY, _PROCESSOR = bytes([2, 80]), bytes([1, 80]), 84
+_HEADER_KEY, _PARAMETER_KEY, _PROCESSOR = b"\2P", b"\1P", 84
 
 
 def write_c3d(motion: Motion, path: Path) -> str | None:
@@ -82,7 +82,7 @@ def _points(motion: Motion) -> bytes:
     """Return x, y, z and the residual, by frame and point."""
     values = np.empty((len(motion), len(motion.point_names), 4), "<f4")
     values[..., :3] = 1000.0 * motion.points
-    values[..., 3] = _BOTH_BYTES * np.round(1000.0 * np.nan_to_num(motion.sigma)).clip(max=_MOST_RESIDUAL)
+    values[..., 3] = _BOTH_BYTES * np.round(1000.0 * np.nan_to_num(motion.sigma)).clip(max=np.iinfo(np.int8).max)
     values[~motion.known] = (0.0, 0.0, 0.0, -1.0)
     return values.tobytes()
 

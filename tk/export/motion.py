@@ -15,15 +15,7 @@ from tk.io.results.reader import read_result
 from tk.io.results.status import Status
 from tk.model.body.angles import standing_axes
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.joints import (
-    FOOT_POINTS,
-    JOINTS,
-    REQUIRED_JOINTS,
-    ROWS,
-    SEGMENT_ORIGIN,
-    SEGMENTS,
-    segment_below,
-)
+from tk.model.body.joints import FOOT_POINTS, JOINTS, REQUIRED_JOINTS, ROWS, SEGMENT_ORIGIN, SEGMENTS, segment_below
 from tk.model.body.rotations import to_matrices
 from tk.model.body.skeleton import Skeleton, skeleton_of_names
 from tk.model.motion.derived import derive

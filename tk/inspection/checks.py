@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.inspection.delays import REACH, find_delays, in_frames
-from tk.inspection.leveling import find_up
+from tk.inspection.leveling import SAME_DEG, find_up
 from tk.inspection.people import PeopleWatch, many_people
 from tk.inspection.results import CameraReport, Inspection, Sample
 from tk.io.captures.capture import Capture
@@ -51,8 +51,6 @@ _SPAN = 600
 _HOLES = 0.01
 #: finding: a larger share of the hull at the border of the working volume
 _AT_BORDER = 0.03
-#: finding: a larger angle between the capture's up and the estimated one, degrees
-_TILTED_DEG = 10.0
 
 
 @one_thread()
@@ -288,7 +286,7 @@ def _findings(found: Inspection, capture: Capture, agreement: Agreement) -> list
     if found.leveling.person and not found.leveling.decided:
         lines.append(f"up = {shown(capture.up)}: {found.leveling.how}")
     tilt = np.degrees(np.arccos(np.clip(capture.up_axis @ up_vector(found.leveling.up), -1.0, 1.0)))
-    if tilt > _TILTED_DEG:
+    if tilt > SAME_DEG:
         lines.append(
             f"up = {shown(capture.up)} differs by {tilt:.0f}° from the estimate from cameras and person, "
             f"{shown(found.leveling.up)}: tk calibrate --level writes the estimate to capture.toml"

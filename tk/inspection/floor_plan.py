@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tk.inspection.people import PersonReport
 from tk.io.captures.capture import Capture
 from tk.model.body.skeleton import up_rotation
+from tk.render.canvas import write
 from tk.render.palette import INK, PAPER, VOLUME, WIRE, person_color
 
 Float = NDArray[np.float64]
@@ -19,7 +20,6 @@ Image = NDArray[np.uint8]
 
 #: layout of the floor plan, pixels: longest side, margin, height of a line of text. Appearance only.
 _SIDE, _MARGIN, _LINE = 900, 60, 24
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def floor_plan(capture: Capture, people: Sequence[PersonReport]) -> Image:
@@ -48,7 +48,7 @@ def floor_plan(capture: Capture, people: Sequence[PersonReport]) -> Image:
         x, y = pixel(center)
         cv2.circle(image, (x, y), 6, WIRE, cv2.FILLED, cv2.LINE_AA)
         cv2.line(image, (x, y), pixel(center + 0.3 * ahead), WIRE, 2, cv2.LINE_AA)
-        cv2.putText(image, camera.name, (x + 9, y - 6), _FONT, 0.45, WIRE, 1, cv2.LINE_AA)
+        write(image, camera.name, x + 9, y - 6, WIRE)
     for person, path in zip(people, paths, strict=True):
         color = person_color(person.number)
         pixels = [pixel(point) for point in path]
@@ -59,14 +59,12 @@ def floor_plan(capture: Capture, people: Sequence[PersonReport]) -> Image:
         if len(pixels) > 1 and pixels[-1] != pixels[-2]:
             cv2.arrowedLine(image, pixels[-2], pixels[-1], color, 3, cv2.LINE_AA, tipLength=0.9)
         cv2.circle(image, pixels[0], 12, color, cv2.FILLED, cv2.LINE_AA)
-        cv2.putText(image, str(person.number), (pixels[0][0] - 5, pixels[0][1] + 5), _FONT, 0.5, PAPER, 2, cv2.LINE_AA)
+        write(image, str(person.number), pixels[0][0] - 5, pixels[0][1] + 5, PAPER, 0.5)
     metre = round(scale)
     cv2.line(image, (_MARGIN, height - 14), (_MARGIN + metre, height - 14), INK, 2)
-    cv2.putText(image, "1 m", (_MARGIN + metre + 8, height - 10), _FONT, 0.45, INK, 1, cv2.LINE_AA)
+    write(image, "1 m", _MARGIN + metre + 8, height - 10, INK)
     x, y = corners.reshape(-1, 2).min(axis=0).tolist()
-    cv2.putText(image, "working volume", (x, y - 8), _FONT, 0.45, VOLUME, 1, cv2.LINE_AA)
+    write(image, "working volume", x, y - 8, VOLUME)
     for k, person in enumerate(people):
-        text = person.line(len(capture.rig))
-        color = person_color(person.number)
-        cv2.putText(image, text, (10, height + _LINE * (k + 1)), _FONT, 0.42, color, 1, cv2.LINE_AA)
+        write(image, person.line(len(capture.rig)), 10, height + _LINE * (k + 1), person_color(person.number))
     return np.asarray(image, np.uint8)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
+from tk.io.captures.scene import UP_AGREE_DEG
 from tk.io.paths import replacing
 from tk.io.toml import parse_toml, read_text
 from tk.model.cameras.mounting import FoundUp
@@ -27,14 +28,12 @@ Float = NDArray[np.float64]
 
 #: least ratio of the largest two standard deviations of a standing person's voxels; people who crouch have less
 _LONG = 1.6
+#: standard deviations of the up direction, degrees: from level cameras or a standing person, from rolled cameras
+_LEVEL_DEG, _ROLLED_DEG = 2.0, 8.0
 #: metres, largest second standard deviation of one person's voxels: several people, or a table, are wider
 _WIDE_M = 0.35
-#: standard deviations of the up direction, degrees: from level cameras, from rolled cameras, from a standing person
-_LEVEL_DEG, _ROLLED_DEG, _LEANING_DEG = 2.0, 8.0, 1.5
-#: if two directions differ more, degrees, they contradict each other
-_AGREE_DEG = 25.0
-#: without a person, cameras that are rolled do not contradict a direction that differs less, degrees
-_UNSURE_DEG = 10.0
+#: directions that differ by less are the same, degrees
+SAME_DEG = 10.0
 #: percentile of the voxels' heights that is the floor; lower voxels come from specks in the masks
 _FLOOR_PERCENTILE = 0.5
 
@@ -89,26 +88,26 @@ def _decide(cameras: FoundUp, given: Float, person: Float | None, axes: Sequence
     """
     rough = up_vector(cameras.up)
     if person is None:
-        if cameras.sure and (cameras.level or _degrees(rough, given) <= _UNSURE_DEG):
+        if cameras.sure and (cameras.level or _degrees(rough, given) <= SAME_DEG):
             return rough, cameras.how, True
         why = f"{cameras.how}, and nobody stands alone in view"
         return given, f"it cannot be decided: {why}", False
     from_given = _degrees(person, given)
     if not cameras.sure:
-        if from_given <= _AGREE_DEG:
+        if from_given <= UP_AGREE_DEG:
             axis = any(np.array_equal(given, up_vector(name)) for name in UP_AXES)
             how = f"as the person stands, {from_given:.0f}° from the capture's; {cameras.how}"
-            return (given if axis and from_given <= _UNSURE_DEG else person), how, True
+            return (given if axis and from_given <= SAME_DEG else person), how, True
         return given, f"it cannot be decided: the axis of the person differs by {from_given:.0f}°; {cameras.how}", False
     apart = _degrees(person, rough)
-    if apart > _AGREE_DEG:
-        if _degrees(rough, given) <= _AGREE_DEG:
+    if apart > UP_AGREE_DEG:
+        if _degrees(rough, given) <= UP_AGREE_DEG:
             return rough, f"{cameras.how}; the axis of the person, who may lie or sit, differs by {apart:.0f}°", True
         why = f"the cameras are mounted along {shown(cameras.up)}, the person along {shown(up_text(person.round(5)))}"
         return given, f"it cannot be decided: {why}", False
     # weighted by the variances; that of the person grows when the person leans or raises an arm
     deviations = np.array([_degrees(a if a @ person >= 0 else -a, person) for a in axes])
-    variance = _LEANING_DEG**2 + float((deviations**2).mean()) / max(len(axes) / 2, 1)
+    variance = _LEVEL_DEG**2 + float((deviations**2).mean()) / max(len(axes) / 2, 1)
     other = (_LEVEL_DEG if cameras.level else _ROLLED_DEG) ** 2
     up = rough if cameras.up in UP_AXES else _unit(rough / other + person / variance)
     return up, f"{cameras.how}; the axis of the person differs by {apart:.0f}°", True

@@ -26,7 +26,6 @@ Float = NDArray[np.float64]
 
 #: layout, pixels: height of a tile, height of a line of text, width of a column of a terminal
 _TILE, _LINE, _COLUMN = 300, 20, 9
-_SIZE = 0.45  # of the letters
 _MASK, _HULL, _UP = of_hue(120.0), of_hue(300.0), of_hue(45.0)
 _LEGEND = (
     ("mask", _MASK),
@@ -61,7 +60,7 @@ def _text(inspection: Inspection, width: int) -> Image:
     x, y = 10, (len(wrapped) + 1) * _LINE
     for name, color in _LEGEND:
         cv2.line(image, (x, y - 5), (x + 24, y - 5), color, 3, cv2.LINE_AA)
-        x = write(image, name, x + 30, y, INK, _SIZE) + 20
+        x = write(image, name, x + 30, y, INK) + 20
     return image
 
 
@@ -74,7 +73,7 @@ def _wrapped(line: str, most: int) -> list[str]:
         line = line.replace(sign, ascii)
     parts = [""]
     for word in line.split(" "):
-        if "  " not in line and text_width(parts[-1] + word, _SIZE) >= most:
+        if "  " not in line and text_width(parts[-1] + word) >= most:
             parts.append("  ")
         parts[-1] += word + " "
     return [part.rstrip() for part in parts]
@@ -85,8 +84,8 @@ def _columns(image: Image, line: str, y: int, color: tuple[int, int, int]) -> No
     cells = list(re.finditer(r"\S+(?: \S+)*", line))
     for cell in cells:
         first = cell is cells[0]
-        left = 10 if first else 10 + _COLUMN * cell.end() - text_width(cell[0], _SIZE)
-        write(image, cell[0], left, y, color, _SIZE)
+        left = 10 if first else 10 + _COLUMN * cell.end() - text_width(cell[0])
+        write(image, cell[0], left, y, color)
 
 
 def _tile(capture: Capture, inspection: Inspection, frame: Sample, c: int) -> Image:

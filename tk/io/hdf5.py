@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 
 import h5py
 import numpy as np
+from h5py import h5z
 from numpy.typing import NDArray
 
 from tk.errors import ResultError, TkError
@@ -26,8 +27,8 @@ from tk.io.paths import text_of
 #: limits of groups and datasets in a file, nested groups, bytes of an attribute: far more than a result has
 MAX_OBJECTS, MAX_DEPTH, MAX_ATTRIBUTE_BYTES = 10_000, 12, 1_000_000
 
-#: filters that only compress or check: deflate, shuffle, Fletcher's checksum, and h5py's LZF
-FILTERS = (1, 2, 3, 32000)
+#: filters that only compress or check
+FILTERS = (h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32, h5z.FILTER_LZF)
 
 #: limits of the compression ratio, and of the declared bytes of a dataset without stored data (HDF5 does not store
 #: chunks that were never written)

@@ -15,17 +15,17 @@ from tk.io.hdf5_writer import Hdf5Writer, writing
 from tk.io.paths import Kind, check_output, looks_like
 from tk.io.results.data import HullPoints
 from tk.io.results.files import hdf5_kind
-from tk.io.results.layout import create_growing, file_attributes
+from tk.io.results.layout import HULL_CHUNK, create_growing, file_attributes
 from tk.model.cameras.volume import VoxelGrid
 
 HULL_FORMAT = "tk-hull"
 
 PLY = Kind("a PLY file", (".ply",), looks_like(rb"ply\n|ply\r"))
 
-#: datasets of a hull file: shape of a row, type, and rows per chunk
+#: datasets of a hull file: shape of a row, and type
 _HULL_ROWS = {
-    "frames": ((), "i8", 1024), "time": ((), "f8", 1024), "hull/offsets": ((), "i8", 1024),
-    "hull/positions": ((3,), "f4", 16384), "hull/colors": ((3,), "u1", 16384),
+    "frames": ((), "i8"), "time": ((), "f8"), "hull/offsets": ((), "i8"),
+    "hull/positions": ((3,), "f4"), "hull/colors": ((3,), "u1"),
 }  # fmt: skip
 _SPACE = "make space"
 
@@ -78,7 +78,7 @@ def write_hulls(path: Path, capture: Capture, grid: VoxelGrid, frames: Iterable[
         with writing(path, _SPACE):
             disk.file.attrs.update(file_attributes(HULL_FORMAT, 1))
             disk.file.attrs.update(fps=capture.fps, up=capture.up, capture=capture.name, voxel_m=grid.voxel_m)
-            data = {name: create_growing(disk.file, name, *row) for name, row in _HULL_ROWS.items()}
+            data = {name: create_growing(disk.file, name, *row, HULL_CHUNK) for name, row in _HULL_ROWS.items()}
             data["hull/offsets"].resize(1, axis=0)
         for frame, points in frames:
             with writing(path, _SPACE):

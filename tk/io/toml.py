@@ -23,7 +23,7 @@ _toml = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "t
 LARGE = 1e9
 
 #: most bytes of a TOML file. A calibration has some hundred a camera; a larger file was not written by a person.
-MOST_BYTES = 2**24
+MOST_BYTES = 16_777_216
 
 
 def load_toml(path: Path, error: type[TkError] = CaptureError) -> dict[str, Any]:

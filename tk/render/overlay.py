@@ -95,12 +95,7 @@ class Overlay:
         return taken()
 
     def sheet_row(
-        self,
-        frame: int,
-        images: Sequence[Image],
-        tile_height: int = 360,
-        full: bool = False,
-        truth: bool = True,
+        self, frame: int, images: Sequence[Image], tile_height: int = 360, full: bool = False, truth: bool = True
     ) -> Image:
         """Return a row of tiles of a frame, one per camera: the part with the person, or the ``full`` images.
 

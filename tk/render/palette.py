@@ -23,7 +23,7 @@ _HUES_DEG = {"": 135.0, "arm_l": 25.0, "leg_l": 5.0, "arm_r": 215.0, "leg_r": 28
 
 # Hue of the second person, and the angle to the next one's, degrees: the golden angle, which keeps any number of hues
 # apart. People after the first are drawn in one colour each.
-_SECOND_DEG, _NEXT_DEG = 50.0, 180.0 * (3.0 - np.sqrt(5.0))
+_SECOND_DEG, _NEXT_DEG = 50.0, 137.50776
 
 
 def of_hue(hue_deg: float, lightness: float = 0.5, saturation: float = 0.8) -> Color:

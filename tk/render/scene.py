@@ -23,7 +23,7 @@ Float = NDArray[np.float64]
 
 # Appearance only; no measurement depends on these values.
 WIDTH, HEIGHT = 960, 720  # pixels
-_FIELD_OF_VIEW_DEG = 38.0
+FIELD_OF_VIEW_DEG = 38.0
 _TURN_S = 16.0  # duration of a whole turn
 _PYRAMID_M = 0.25  # height of a camera's pyramid
 _NEAREST_M = 0.05  # near clipping plane
@@ -69,7 +69,7 @@ class Scene:
         self._legend = Legend(self.people, WIDTH)
         self.rig = rig or (result.cameras.rig if result.cameras else None)
         self._middles, reach = _followed(self.people.figures, result.meta.fps)
-        self._distance = reach / np.sin(np.radians(_FIELD_OF_VIEW_DEG / 2))
+        self._distance = reach / np.sin(np.radians(FIELD_OF_VIEW_DEG / 2))
 
     def rows(self, frames: Sequence[int] = ()) -> list[int]:
         """Return the rows of these frames; all rows by default."""
@@ -106,7 +106,7 @@ class Scene:
         level = axes @ np.array([np.cos(turn), np.sin(turn), 0.0])
         forward = -(np.cos(elevation) * level + np.sin(elevation) * up)
         return camera_towards(
-            self._middles[row] - self._distance * forward, forward, up, (WIDTH, HEIGHT), _FIELD_OF_VIEW_DEG
+            self._middles[row] - self._distance * forward, forward, up, (WIDTH, HEIGHT), FIELD_OF_VIEW_DEG
         )
 
     def _draw_floor(self, tile: Image, eye: Camera) -> None:

@@ -27,10 +27,7 @@ def film_for(capture: Capture, result_path: Path) -> Film | None:
 
 
 def write_video_and_report(
-    capture: Capture,
-    result_path: Path,
-    warn: Callable[[str], None],
-    film: Film | None = None,
+    capture: Capture, result_path: Path, warn: Callable[[str], None], film: Film | None = None
 ) -> list[Path]:
     """Write RESULT.mp4 and RESULT.html, and return the paths of the files written.
 

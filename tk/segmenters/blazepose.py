@@ -19,10 +19,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.model.body.body_points import LANDMARKS
 from tk.model.masks.sightings import Sighting
 from tk.segmenters.weights import weights
-
-_DETECTOR_SIDE, _POSE_SIDE = 224, 256
 
 # one network is loaded at a time: the process's stderr is closed meanwhile
 _LOADING = threading.Lock()
@@ -30,21 +29,17 @@ _LOADING = threading.Lock()
 # The detector's anchors: cells per side of each grid, and anchors per cell (MediaPipe's pose_detection_cpu.pbtxt:
 # strides 8, 16, 32, 32, 32, two anchors each).
 _GRIDS = ((28, 2), (14, 2), (7, 6))
-# columns: middle and size of the box, mid-hip point, point on the circle around the body
-_BOX, _SIZE, _HIPS, _CIRCLE = (slice(k, k + 2) for k in range(0, 8, 2))
 _LEAST_SCORE = 0.5  # MediaPipe's value
 # Least probability that the square shows a person. Of people who hide each other, landmarks with 0.24 are right.
 _LEAST_PRESENT = 0.05
-# The pose network's points, each with x, y, z, visibility, presence (MediaPipe's tensors_to_pose_landmarks).
-_POINTS, _COLUMNS = 39, 5
-_VISIBLE = 3  # column, a logit
-_WORLD = 3  # columns of the points in space: metres from the middle of the hips, along the image's axes and away
-# Rows of the network's points that correspond to a point of the body; the eyes are their centres.
-_ROWS = {
-    "nose": 0, "eye_l": 2, "eye_r": 5, "ear_l": 7, "ear_r": 8, "shoulder_l": 11, "shoulder_r": 12, "elbow_l": 13,
-    "elbow_r": 14, "wrist_l": 15, "wrist_r": 16, "hip_l": 23, "hip_r": 24, "knee_l": 25, "knee_r": 26, "ankle_l": 27,
-    "ankle_r": 28, "heel_l": 29, "heel_r": 30, "toe_l": 31, "toe_r": 32,
-}  # fmt: skip
+# The pose network's points, in order; the eyes are their centres.
+_POINTS = (
+    "nose", "eye_inner_l", "eye_l", "eye_outer_l", "eye_inner_r", "eye_r", "eye_outer_r", "ear_l", "ear_r", "mouth_l",
+    "mouth_r", "shoulder_l", "shoulder_r", "elbow_l", "elbow_r", "wrist_l", "wrist_r", "pinky_l", "pinky_r",
+    "index_l", "index_r", "thumb_l", "thumb_r", "hip_l", "hip_r", "knee_l", "knee_r", "ankle_l", "ankle_r", "heel_l",
+    "heel_r", "toe_l", "toe_r",
+)  # fmt: skip
+_USED = [_POINTS.index(name) for name in LANDMARKS]
 # Detections whose boxes, which hold the head, overlap by more (intersection over union) are one person: MediaPipe's
 # value. The heads of two dancers are apart.
 _SAME = 0.3
@@ -64,7 +59,7 @@ class BlazePose:
         ConfigError: the weights are missing and cannot be downloaded.
     """
 
-    landmarks = tuple(_ROWS)
+    landmarks = LANDMARKS
     parallel = True
 
     def __init__(self) -> None:
@@ -81,16 +76,19 @@ class BlazePose:
 
     def find(self, image: NDArray[np.uint8]) -> list[Sighting]:
         """Return the people in an image (h, w, 3) BGR, the most certain first."""
-        square, scale = _in_square(image, _DETECTOR_SIDE)
-        found = self._network("pose_detection")(square / np.float32(127.5) - 1)
-        rows, logits = (found[i][0] for i in np.argsort([-array.shape[-1] for array in found]))
+        network = self._network("pose_detection")
+        square, scale = _in_square(image, network.side)
+        # of each anchor one number, and twelve: middle and size of the box, mid-hip point, point on the circle around
+        # the body, two more
+        logits, rows = sorted((array[0] for array in network(square / np.float32(127.5) - 1)), key=np.size)
         scores = 1 / (1 + np.exp(-np.clip(logits[:, 0].astype(np.float64), -100, 100)))
         sure = np.flatnonzero(scores >= _LEAST_SCORE)
         sure = sure[np.argsort(-scores[sure], kind="stable")]
-        anchors = self._anchors[sure] * _DETECTOR_SIDE
-        box, hips, circle = ((rows[sure, part] + anchors) / scale - 0.5 for part in (_BOX, _HIPS, _CIRCLE))
+        middle, size, hip, edge, *_ = np.moveaxis(rows.reshape(len(rows), -1, 2)[sure], 1, 0)
+        anchors = self._anchors[sure] * network.side
+        box, hips, circle = ((part + anchors) / scale - 0.5 for part in (middle, hip, edge))
         weight, people = scores[sure], []
-        for same in suppressed(box, rows[sure, _SIZE] / scale):
+        for same in suppressed(box, size / scale):
             share = weight[same, None] / weight[same].sum()
             x, y = (share * hips[same]).sum(axis=0)
             u, v = (share * circle[same]).sum(axis=0)
@@ -104,26 +102,27 @@ class BlazePose:
     def segment_pose(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
         """See :class:`~tk.segmenters.PoseSegmenter`."""
         height, width = image.shape[:2]
-        square, scale = _in_square(image, _POSE_SIDE)
-        found = self._network("pose_landmark_full")(square / np.float32(255))
-        (logits,) = (a for a in found if a.shape[1:3] == (_POSE_SIDE,) * 2)
-        (rows,) = (a.reshape(-1, _COLUMNS) for a in found if a.size == _POINTS * _COLUMNS)
-        used = rows[list(_ROWS.values())].astype(np.float64)
-        (world,) = (a.reshape(-1, _WORLD) for a in found if a.size == _POINTS * _WORLD)
-        depth = world[list(_ROWS.values()), 2].astype(np.float64)
-        landmarks = np.column_stack([(used[:, :2] + 0.5) / scale - 0.5, _probability(used[:, _VISIBLE]), depth])
-        (present,) = (float(a.item()) for a in found if a.size == 1)
-        landmarks[:, 2] *= present
+        network = self._network("pose_landmark_full")
+        square, scale = _in_square(image, network.side)
+        found = network(square / np.float32(255))
+        # Of each point three numbers in space, metres from the middle of the hips, along the image's axes and away; and
+        # five in the image: x, y, z, visibility, presence (MediaPipe's tensors_to_pose_landmarks).
+        present, world, points = (array[0] for array in sorted(found, key=np.size)[:3])
+        x, y, _, visible, _ = points.reshape(-1, 5)[_USED].T.astype(np.float64)
+        pixels = (np.stack([x, y], axis=1) + 0.5) / scale - 0.5
+        depth = world.reshape(-1, 3)[_USED, 2].astype(np.float64)
+        landmarks = np.column_stack([pixels, _probability(visible) * present, depth])
         if not present >= _LEAST_PRESENT:
             landmarks[:] = np.nan
         side = max(height, width)
         # enlarged before thresholding, so that the outline is finer than the network's pixels
-        whole = cv2.resize(logits[0, :, :, 0], (side, side), interpolation=cv2.INTER_LINEAR)
+        (logits,) = (array[0, :, :, 0] for array in found if array.shape[1:3] == square.shape[:2])
+        whole = cv2.resize(logits, (side, side), interpolation=cv2.INTER_LINEAR)
         return np.asarray(_probability(whole[:height, :width]), np.float32), landmarks
 
 
 class _Network:
-    """A TensorFlow Lite network with one input (1, n, n, 3)."""
+    """A TensorFlow Lite network with one input (1, n, n, 3); ``side``: n."""
 
     def __init__(self, path: Path) -> None:
         from ai_edge_litert.interpreter import Interpreter
@@ -131,7 +130,8 @@ class _Network:
         with _LOADING, _silent():
             self._interpreter = Interpreter(str(path), num_threads=1)
             self._interpreter.allocate_tensors()
-        self._input = self._interpreter.get_input_details()[0]["index"]
+        (given,) = self._interpreter.get_input_details()
+        self._input, self.side = given["index"], int(given["shape"][1])
         self._outputs = [detail["index"] for detail in self._interpreter.get_output_details()]
 
     def __call__(self, image: NDArray[np.floating]) -> list[NDArray[Any]]:

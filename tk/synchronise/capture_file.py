@@ -12,6 +12,7 @@ import tomli_w
 
 from tk.errors import CaptureError, unwritable
 from tk.io.captures.calibration import Calibration
+from tk.io.captures.timing import nominal_rate
 from tk.io.paths import check_not_input, replacing
 from tk.io.toml import load_toml
 from tk.synchronise.raw import Recording
@@ -91,7 +92,7 @@ def write_capture(
     document: dict[str, object] = {key: value for key, value in before.items() if not isinstance(value, dict)}
     unit = 10**_SPAN_DIGITS  # rounded inwards: the first and the last frame have images
     begin, end = math.ceil(span[0] * unit - 1e-6) / unit, math.floor(span[1] * unit + 1e-6) / unit
-    document |= {"fps": _plain(fps), "from": begin, "to": end}
+    document |= {"fps": round(nominal_rate(fps), _RATE_DIGITS), "from": begin, "to": end}
     document |= {key: value for key, value in before.items() if isinstance(value, dict)}
     document.pop("background", None)
     if empty is not None:
@@ -123,11 +124,3 @@ def _relative(path: Path, folder: Path) -> str:
     real, base = path.resolve(), folder.resolve()
     common = Path(os.path.commonpath([real, base]))
     return os.path.relpath(real, base) if common != Path(common.anchor) else str(real)
-
-
-def _plain(fps: float) -> float:
-    """Return a rate without the rounding of time stamps: whole, or 1000/1001 of a whole one."""
-    for nominal in (round(fps), round(1.001 * fps) / 1.001):
-        if abs(nominal / fps - 1) < 3e-4:
-            return float(nominal)
-    return round(fps, 4)

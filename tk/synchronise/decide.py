@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tk.errors import ClockError
 from tk.synchronise.raw import Recording
-from tk.synchronise.ties import Clocks, Tie, connected_to, solve
+from tk.synchronise.ties import OUTLIER_SIGMA, Clocks, Tie, connected_to, solve
 
 Float = NDArray[np.float64]
 
@@ -18,12 +18,10 @@ Float = NDArray[np.float64]
 METHODS = ("cameras", "flash", "person", "sound", "timecode")
 #: names of the methods in tables
 SHOWN = {"cameras": "motion, known cameras", "person": "motion"}
-#: seconds that sound and pictures of a camera may differ: what devices add, and a way of 10 m
-SKEW_S = 0.04 + 0.003 * 10
+#: seconds that sound and pictures of a camera may differ: what devices add, 0.04, and a way of 10 m
+SKEW_S = 0.07
 #: seconds above which sound and pictures are not of one recording
 _OTHER_S = 0.25
-#: differences between two methods of pictures are a contradiction above so many sigma
-_SIGMAS = 4.0
 
 
 @dataclass
@@ -64,7 +62,7 @@ def decide(recordings: Sequence[Recording], ties: Sequence[Tie], reasons: dict[i
         for other in pictures[n + 1 :]:
             for c, apart, sigma in _differences(recordings, by_kind[one], by_kind[other]):
                 interval = recordings[c].interval_s
-                if abs(apart) > max(_SIGMAS * sigma, 1.5 * interval):
+                if abs(apart) > max(OUTLIER_SIGMA * sigma, 1.5 * interval):
                     unsure[c] = (
                         f"{SHOWN.get(one, one)} and {SHOWN.get(other, other)} contradict each other by "
                         f"{_seconds(apart)}"
@@ -81,7 +79,7 @@ def decide(recordings: Sequence[Recording], ties: Sequence[Tie], reasons: dict[i
             kept["sound"] = [tie for tie in kept["sound"] if c not in (tie.i, tie.j)]
     certain = [tie for kind in METHODS[:-1] for tie in kept[kind]]
     for c, apart, sigma in _differences(recordings, by_kind["timecode"], certain):
-        if abs(apart) > max(_SIGMAS * sigma, 2 * recordings[c].interval_s):
+        if abs(apart) > max(OUTLIER_SIGMA * sigma, 2 * recordings[c].interval_s):
             notes.append(f"{recordings[c].where}: its timecode differs by {_seconds(apart)}, and is not used")
     used = certain
     if by_kind["timecode"] and not connected_to(0, count, [(tie.i, tie.j) for tie in certain]).all():

@@ -13,19 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.synchronise.looks import Look
+from tk.synchronise.looks import DIFFERS, SOMEBODY, Look
+from tk.synchronise.person import GRID_HZ
 from tk.synchronise.ties import Clocks
 
 Float = NDArray[np.float64]
 
 #: least length of the empty part, and what is left off at each end, seconds
 _LEAST_S, _MARGIN_S = 1.5, 0.2
-#: 1/s: of the clock on which motion is compared
-_HZ = 10.0
-#: share of pixels that may move in a still image: noise
-_STILL = 0.002
-#: grey levels of a difference, and share of an image that differs while somebody is there
-_DIFFERS, _PERSON = 18.0, 0.003
 #: images with motion that are compared with the still one; share of them that must show the outline
 _SAMPLES, _CLEAR = 24, 0.8
 #: by how much stronger the outline is in the images with motion than in the still one
@@ -36,19 +31,18 @@ def find_empty(looks: Sequence[Look], clocks: Clocks) -> tuple[float, float] | N
     """Return the common time at which the longest empty part begins and ends, seconds; None if none is certain."""
     begin = max(clocks.common(c, float(look.times_s[0])) for c, look in enumerate(looks))
     end = min(clocks.common(c, float(look.times_s[-1])) for c, look in enumerate(looks))
-    clock = np.arange(begin, end, 1 / _HZ)
-    if len(clock) < 2 * _LEAST_S * _HZ:
+    clock = np.arange(begin, end, 1 / GRID_HZ)
+    if len(clock) < 2 * _LEAST_S * GRID_HZ:
         return None
     moving = np.zeros(len(clock), np.bool_)
     for c, look in enumerate(looks):
-        share = (look.changes > 0).mean(axis=(1, 2))
         at = np.asarray([clocks.common(c, float(time)) for time in look.middles_s])
-        step = np.clip(np.rint((at - begin) * _HZ).astype(int), 0, len(clock) - 1)
-        np.logical_or.at(moving, step, (share > _STILL) & (at > begin - 0.05) & (at < end + 0.05))
+        step = np.clip(np.rint((at - begin) * GRID_HZ).astype(int), 0, len(clock) - 1)
+        np.logical_or.at(moving, step, (look.moving > SOMEBODY) & (at > begin - 0.05) & (at < end + 0.05))
     if not moving.any():
         return None
-    for first, last in _runs(~moving):
-        start, stop = clock[first] + _MARGIN_S, clock[last] - _MARGIN_S
+    for first, end in runs(~moving):
+        start, stop = clock[first] + _MARGIN_S, clock[end - 1] - _MARGIN_S
         if stop - start >= _LEAST_S and all(
             _is_empty(look, (np.array([start, stop]) - clocks.offsets_s[c]) / clocks.rates[c])
             for c, look in enumerate(looks)
@@ -57,11 +51,10 @@ def find_empty(looks: Sequence[Look], clocks: Clocks) -> tuple[float, float] | N
     return None
 
 
-def _runs(still: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return first and last index of the runs of True, the longest first."""
+def runs(still: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the indices at which runs of True begin and end, the longest run first."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
-    runs = [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-    return sorted(runs, key=lambda run: run[0] - run[1])
+    return sorted(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True), key=lambda run: run[0] - run[1])
 
 
 def _is_empty(look: Look, span: Float) -> bool:
@@ -70,8 +63,7 @@ def _is_empty(look: Look, span: Float) -> bool:
     if inside.sum() < 3:
         return False
     still = np.median(look.greys[inside][:: max(1, int(inside.sum()) // 15)], axis=0).astype(np.float32)
-    changed = (look.changes > 0).mean(axis=(1, 2))
-    busy = np.flatnonzero((changed > _STILL) & ~inside[1:])
+    busy = np.flatnonzero((look.moving > SOMEBODY) & ~inside[1:])
     if len(busy) < 3:
         return False
     chosen = busy[np.unique(np.linspace(0, len(busy) - 1, _SAMPLES).round().astype(int))]
@@ -83,9 +75,9 @@ def _outlined(image: Float | NDArray[np.float32], still: NDArray[np.float32]) ->
     """Return whether an image differs from the still one by something that has its outline in the image."""
     difference = image - still
     difference = difference - np.median(difference)
-    mask = (cv2.GaussianBlur(np.abs(difference), (0, 0), 1.0) > _DIFFERS).astype(np.uint8)
+    mask = (cv2.GaussianBlur(np.abs(difference), (0, 0), 1.0) > DIFFERS).astype(np.uint8)
     mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)), np.uint8)
-    if mask.mean() < _PERSON:
+    if mask.mean() < SOMEBODY:
         return False
     border = (cv2.dilate(mask, np.ones((3, 3), np.uint8)) - cv2.erode(mask, np.ones((3, 3), np.uint8))) > 0
     there, before = _slope(image)[border].mean(), _slope(still)[border].mean()

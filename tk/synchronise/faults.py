@@ -15,19 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.model.cameras.camera import Camera
+from tk.synchronise.empty import runs
 from tk.synchronise.lags import correlate
 from tk.synchronise.looks import SOMEBODY, Look
-from tk.synchronise.person import (
-    DOUBT,
-    GRID_HZ,
-    LEAST_S,
-    NEAR_S,
-    common_deviation,
-    planes_sum,
-    rays_of,
-    shared_planes,
-)
-from tk.synchronise.raw import Recording
+from tk.synchronise.person import DOUBT, GRID_HZ, NEAR_S, common_deviation, planes_sum, rays_of, shared_planes
+from tk.synchronise.raw import SHORTEST_S, Recording
 from tk.synchronise.sound import Heard
 from tk.synchronise.ties import Clocks, Tie
 
@@ -152,7 +144,7 @@ def _compare(reference: Float, own: Float, speed: float) -> tuple[NDArray[np.int
     """Return lags and their significances, of a signal that is played faster by ``speed``; 0 where too little is in
     common."""
     count = int(len(own) / speed)
-    least = round(LEAST_S * GRID_HZ)
+    least = round(SHORTEST_S * GRID_HZ)
     if min(count, len(reference)) < least:
         return np.zeros(0, np.int64), np.zeros(0)
     if speed != 1.0:
@@ -209,7 +201,7 @@ def _parts(recording: Recording, own_start: float, count: int) -> list[tuple[int
     begins = [round((begin - own_start) * GRID_HZ) for begin in recording.begins_s[1:]]
     borders = [begin for begin in begins if 0 < begin < count] or [count // 2]
     ends = [0, *borders, count]
-    return [(a, b) for a, b in pairwise(ends) if b - a > LEAST_S * GRID_HZ]
+    return [(a, b) for a, b in pairwise(ends) if b - a > SHORTEST_S * GRID_HZ]
 
 
 def still_parts(recordings: Sequence[Recording], looks: Sequence[Look], clocks: Clocks) -> list[str]:
@@ -217,22 +209,20 @@ def still_parts(recordings: Sequence[Recording], looks: Sequence[Look], clocks: 
     known = np.flatnonzero(clocks.connected).tolist()
     begin = min(clocks.common(c, float(looks[c].times_s[0])) for c in known)
     end = max(clocks.common(c, float(looks[c].times_s[-1])) for c in known)
-    step = LEAST_S / 4  # some images each, and several of them in the shortest time that is reported
+    step = SHORTEST_S / 4  # some images each, and several of them in the shortest time that is reported
     count = int((end - begin) / step) + 1
     seen, moving = np.zeros((2, len(looks), count), np.bool_)
     for c in known:
         bins = _bins(looks[c], clocks, c, begin, step)
         seen[c, bins] = True
-        moving[c, bins[(looks[c].changes > 0).mean(axis=(1, 2)) > SOMEBODY]] = True
+        moving[c, bins[looks[c].moving > SOMEBODY]] = True
     lines = []
     for c in known:
         others = [k for k in known if k != c]
         active = 2 * moving[others].sum(axis=0) >= np.maximum(seen[others].sum(axis=0), 1)
         still = seen[c] & ~moving[c] & active
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
-        runs = [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-        first, last = max(runs, key=lambda run: run[1] - run[0], default=(0, 0))
-        if (last - first) * step >= LEAST_S:
+        first, last = (*runs(still), (0, 0))[0]
+        if (last - first) * step >= SHORTEST_S:
             own = [(begin + b * step - clocks.offsets_s[c]) / clocks.rates[c] for b in (first, last)]
             lines.append(
                 f"{recordings[c].where}: nothing moves in its picture from {own[0]:.1f} s to {own[1]:.1f} s, and "
@@ -264,7 +254,7 @@ def exchanged(
         return None
     begin = max(clocks.common(c, float(look.middles_s[0])) for c, look in enumerate(looks))
     end = min(clocks.common(c, float(look.middles_s[-1])) for c, look in enumerate(looks))
-    if end - begin < LEAST_S:
+    if end - begin < SHORTEST_S:
         return None
     bins = [_bins(look, clocks, c, begin, _BIN_S) for c, look in enumerate(looks)]
     moved = [_binned(look, own, int((end - begin) / _BIN_S)) for look, own in zip(looks, bins, strict=True)]
@@ -281,7 +271,7 @@ def exchanged(
             return 0.0
         profiles = [planes_sum(moved[v], planes) for v, planes in zip((i, j), shared[:2], strict=True)]
         one, other = (profile - profile.mean(axis=0) for profile in profiles)
-        _, _, z = correlate(one, other, round(LEAST_S / _BIN_S))
+        _, _, z = correlate(one, other, round(SHORTEST_S / _BIN_S))
         return max(float(z[len(other) - 1]), 0.0) ** 2 / 2  # without a lag
 
     def log(exchange: Mapping[int, int]) -> float:

@@ -30,7 +30,7 @@ LOOKED_S, _MOST_HZ = 180.0, 62.0
 _MOVES, _MOST = 3.0, 40.0
 #: of a long recording, to find the person: seconds between key images; grey levels, and share of an image, that differ
 #: while somebody is there (half and twice that share find the same frozen pictures); seconds before that
-_KEYS_S, _DIFFERS, SOMEBODY, _BEFORE_S = 5.0, 18.0, 0.003, 30.0
+_KEYS_S, DIFFERS, SOMEBODY, _BEFORE_S = 5.0, 18.0, 0.003, 30.0
 #: grey levels by which coding changes the small images of one picture; the noise of a camera is more
 _CODING = 8
 
@@ -71,6 +71,11 @@ class Look:
         noise = max(float(np.percentile(found[:: max(1, len(found) // 50)], 70)), 0.7)
         np.clip(found - 4 * noise - _MOVES, 0, _MOST, out=found)
         return found
+
+    @cached_property
+    def moving(self) -> Float:
+        """(N - 1,) share of the pixels that move from image to image."""
+        return np.asarray((self.changes > 0).mean(axis=(1, 2)))
 
     @cached_property
     def moved(self) -> NDArray[np.float32]:
@@ -121,7 +126,7 @@ def first_motion(recording: Recording) -> float | None:
     values = np.stack(greys).astype(np.float32)
     change = values - np.median(values, axis=0)
     change -= np.median(change, axis=(1, 2), keepdims=True)
-    differs = (np.abs(change) > _DIFFERS).mean(axis=(1, 2)) > SOMEBODY
+    differs = (np.abs(change) > DIFFERS).mean(axis=(1, 2)) > SOMEBODY
     first = times[int(np.argmax(differs))] - _BEFORE_S if differs.any() else recording.span[0]
     return first if first > recording.span[0] else None
 

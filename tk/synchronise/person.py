@@ -19,14 +19,13 @@ from scipy.ndimage import gaussian_filter1d
 from tk.model.cameras.camera import Camera
 from tk.synchronise.lags import correlate
 from tk.synchronise.looks import Look
+from tk.synchronise.raw import SHORTEST_S
 from tk.synchronise.ties import Tie, connected_to
 
 Float = NDArray[np.float64]
 
 #: 1/s: of the clock on which signals are compared
 GRID_HZ = 120
-#: seconds that two recordings must have in common
-LEAST_S = 2.0
 #: seconds by which a lag may differ from the best one and be the same: twice the width of most motions. Twice as many
 #: change no answer of :mod:`tk.synchronise.faults`; with half of it, one of 11 right folders has a false speed.
 NEAR_S = 0.35
@@ -125,7 +124,7 @@ def on_grid(times: Float, values: Float) -> tuple[float, Float]:
 
 
 def _compared(i: int, j: int, one: tuple[float, Float], other: tuple[float, Float]) -> Compared:
-    lags, r, z = correlate(one[1], other[1], round(LEAST_S * GRID_HZ))
+    lags, r, z = correlate(one[1], other[1], round(SHORTEST_S * GRID_HZ))
     return Compared(i, j, int(lags[0]), z, r, one[0], other[0])
 
 

@@ -17,18 +17,19 @@ from tk.errors import CaptureError, ClockError
 from tk.io.captures.calibration import Calibration, match_camera, read_calibration
 from tk.io.captures.packets import open_video
 from tk.io.captures.video import VIDEO_SUFFIXES, probe_video
+from tk.io.importers.videos import natural
 from tk.model.cameras.camera import Camera
 
 Float = NDArray[np.float64]
 
-#: seconds; a shorter video shows too little to be compared
+#: seconds; a shorter video, or a shorter part that two videos have in common, shows too little to be compared
 SHORTEST_S = 2.0
 #: GoPro's names: GX020012.MP4 is chapter 2 of recording 12; the chapter stands before the number
 _GOPRO = re.compile(r"G[HXSL](\d\d)(\d{4})$", re.IGNORECASE)
 #: seconds by which a chapter may be created later than the end of the one before: whole seconds, and writing files
 _CREATED_S = 5.0
 #: bytes at both ends by which files are compared
-_COMPARED = 1 << 16
+_COMPARED = 65_536
 _TIMECODE = re.compile(r"(\d\d):(\d\d):(\d\d)([:;.])(\d+)$")
 
 
@@ -179,13 +180,8 @@ def read_cameras(folder: Path, recordings: Sequence[Recording]) -> tuple[Calibra
 
 
 def _videos(folder: Path) -> list[Path]:
-    files = [path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES]
-    return sorted((file for file in files if not file.name.startswith(".")), key=_natural)
-
-
-def _natural(path: Path) -> list[object]:
-    """Return a key that sorts numbers in names by value."""
-    return [int(part) if part.isdigit() else part.lower() for part in re.split(r"(\d+)", path.name)]
+    files = [path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES and path.name[0] != "."]
+    return sorted(files, key=lambda file: natural(file.name.lower()))
 
 
 def _recordings(files: Sequence[Path]) -> Iterator[tuple[Path, ...]]:

@@ -14,6 +14,7 @@ from tk.errors import CaptureError
 from tk.render.canvas import text_width, write, write_png
 from tk.render.palette import INK, PAPER
 from tk.synchronise.looks import Look, pictures_at
+from tk.synchronise.person import GRID_HZ
 from tk.synchronise.raw import Recording
 from tk.synchronise.ties import Clocks
 
@@ -22,8 +23,8 @@ Image = NDArray[np.uint8]
 
 #: height of a picture, of the text above a row, and most width of a picture, pixels
 _HEIGHT, _LINE, _MOST_WIDTH = 300, 26, 540
-#: instants, and seconds between them and the fastest one; 1/s: clock on which it is found
-_INSTANTS, _APART_S, _HZ = 3, 0.3, 30.0
+#: instants, and seconds between them and the fastest one
+_INSTANTS, _APART_S = 3, 0.3
 
 
 def fastest_instants(looks: Sequence[Look], clocks: Clocks, span: tuple[float, float]) -> list[float]:
@@ -33,13 +34,13 @@ def fastest_instants(looks: Sequence[Look], clocks: Clocks, span: tuple[float, f
     if end - begin < 2 * _APART_S:
         middle = (span[0] + span[1]) / 2
         return [middle + (k - _INSTANTS // 2) * min(_APART_S, (span[1] - span[0]) / 4) for k in range(_INSTANTS)]
-    clock = np.arange(begin, end, 1 / _HZ)
+    clock = np.arange(begin, end, 1 / GRID_HZ)
     total = np.zeros(len(clock))
     for c, look in enumerate(looks):
         at = np.array([clocks.common(c, float(time)) for time in look.middles_s])
         amount = np.sqrt(look.changes.mean(axis=(1, 2)) / np.diff(look.times_s))
         total += np.minimum(np.interp(clock, at, amount / (amount.mean() + 1e-9)), 4.0)
-    total = np.convolve(total, np.ones(5) / 5, "same")
+    total = np.convolve(total, np.ones(GRID_HZ // 6), "same")
     inside = (clock > begin + _APART_S) & (clock < end - _APART_S)
     peak = float(clock[np.argmax(np.where(inside, total, -1.0))])
     return [peak + (k - _INSTANTS // 2) * _APART_S for k in range(_INSTANTS)]
@@ -69,7 +70,7 @@ def write_sheet(path: Path, recordings: Sequence[Recording], clocks: Clocks, ins
             name = recording.name.encode("ascii", "replace").decode()
             text = f"{name}  {own:.2f} s of its own" + (f"   common time {at:.2f} s" if c == 0 else "")
             width = _cut(column[0]).shape[1]
-            size = min(0.45, 0.45 * (width - 12) / max(text_width(text, 0.45), 1))
+            size = 0.42 * min(1.0, (width - 12) / max(text_width(text), 1))
             write(head, text, x + 6, _LINE - 9, INK, size)
             x += width
         rows += [head, row]

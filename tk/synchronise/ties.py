@@ -15,9 +15,9 @@ RATE_SIGMA = 50e-6
 #: standard deviation of the time between sound and pictures of a camera, seconds: a way of some metres, and what the
 #: device adds
 SOUND_SIGMA_S = 0.015
-#: two cameras are an outlier if their ties differ from the others' solution by more than so many sigma, and by more
-#: than this, seconds
-_OUTLIER_SIGMA, _OUTLIER_S = 5.0, 0.01
+#: two cameras are an outlier, and two methods contradict each other, if ties differ by more than so many sigma; two
+#: cameras by more than this, seconds, too
+OUTLIER_SIGMA, _OUTLIER_S = 5.0, 0.01
 #: a rate counts as determined if its standard deviation is below this, relative
 KNOWN_RATE = 15e-6
 #: prior of a rate that is not estimated, relative
@@ -94,7 +94,7 @@ def solve(count: int, ties: Sequence[Tie], reference: int = 0, skew_sigma_s: flo
         for pair in {(tie.i, tie.j, tie.kind) for tie in kept}:
             own = [(r, tie) for r, tie in zip(residuals, kept, strict=True) if (tie.i, tie.j, tie.kind) == pair]
             off = abs(float(np.median([r for r, _ in own])))
-            limit = max(_OUTLIER_S, _OUTLIER_SIGMA * float(np.median([tie.sigma_s for _, tie in own])))
+            limit = max(_OUTLIER_S, OUTLIER_SIGMA * float(np.median([tie.sigma_s for _, tie in own])))
             rest = [(tie.i, tie.j) for tie in kept if (tie.i, tie.j, tie.kind) != pair]
             same = np.array_equal(connected_to(reference, count, rest), clocks.connected)
             if off > limit * size and same:

@@ -12,13 +12,13 @@ from tk.io.results.status import STATUS_MEANING
 from tk.model.cameras.camera import Rig
 from tk.render.palette import BONE, ELEVATION_DEG, FLOOR, WIRE, unit_rgb
 from tk.render.people import People
+from tk.render.scene import FIELD_OF_VIEW_DEG
 from tk.view import shapes
 
 Float = NDArray[np.float64]
 
 # Appearance only; no measurement depends on these values.
 SIZE = (1280, 860)  # pixels
-FIELD_OF_VIEW_DEG = 40.0
 _AZIMUTH = 0.6  # radians
 
 

@@ -17,7 +17,7 @@ from tk.render.scene import PYRAMID_EDGES, camera_pyramid
 
 Float = NDArray[np.float64]
 
-_JOINT_M, _TRUTH_M = 0.022, 0.018  # radii of the spheres, metres; appearance only
+_BALL_M = 0.02  # radius of the spheres, metres; appearance only
 
 
 def body_mesh(figure: Figure, row: int) -> Any:
@@ -55,13 +55,13 @@ def joint_spheres(joints: Float, sigma: Float | None) -> Any:
     if sigma is not None:
         finite = np.isfinite(sigma)
         colors[finite] = sigma_colors(sigma[finite])[:, ::-1] / 255
-    return _spheres(joints[known], colors[known], _JOINT_M)
+    return _spheres(joints[known], colors[known], _BALL_M)
 
 
 def truth_spheres(joints: Float) -> Any:
     """Return white spheres at the ground-truth joints (15, 3)."""
     known = joints[np.isfinite(joints).all(axis=1)]
-    return _spheres(known, np.ones((len(known), 3)), _TRUTH_M)
+    return _spheres(known, np.ones((len(known), 3)), _BALL_M)
 
 
 def hull_cloud(points: HullPoints) -> Any:

@@ -15,9 +15,9 @@ import numpy as np
 
 from tk.errors import DisplayError, ExportError
 from tk.render.palette import BACKGROUND, unit_rgb
-from tk.render.scene import camera_towards
+from tk.render.scene import FIELD_OF_VIEW_DEG, camera_towards
 from tk.system import LINUX
-from tk.view.contents import FIELD_OF_VIEW_DEG, SIZE, Contents
+from tk.view.contents import SIZE, Contents
 
 _ALTERNATIVE = "tk report RESULT.h5 writes an HTML page to look at instead"
 _KEYS = (

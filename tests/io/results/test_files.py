@@ -194,7 +194,7 @@ from tests.io.result_files import append, make_smoothed
 from tests.io.result_victim import META
 from tk.errors import ResultError, TkError
 from tk.io.results.reader import read_result
-from tk.io.results.revision import revise_result
+from tests.io.result_files import revise_result
 from tk.io.results.writer import ResultWriter
 path = Path(sys.argv[1])
 try:

@@ -9,11 +9,10 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.io.result_files import assert_equal_values, make_cameras, make_smoothed, write
+from tests.io.result_files import assert_equal_values, make_cameras, make_smoothed, revise_result, write
 from tests.io.result_victim import META, make_frame, make_run, make_state
 from tk.errors import ResultError
 from tk.io.results.reader import read_joints, read_people, read_result
-from tk.io.results.revision import revise_result
 from tk.io.results.schema import columns_of
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter

@@ -16,12 +16,11 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.io.result_files import append, assert_complete, assert_equal_values, resume, write
+from tests.io.result_files import append, assert_complete, assert_equal_values, resume, revise_result, write
 from tests.io.result_victim import META, make_frame, make_run, make_state
 from tk.errors import ResultError
 from tk.io.results.layout import pack_state
 from tk.io.results.reader import read_result
-from tk.io.results.revision import revise_result
 from tk.io.results.writer import ResultWriter
 
 ROOT = Path(__file__).parents[3]

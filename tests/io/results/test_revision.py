@@ -17,12 +17,12 @@ from tests.io.result_files import (
     make_cameras,
     make_smoothed,
     resume,
+    revise_result,
     write,
 )
 from tests.io.result_victim import META, make_frame
 from tk.errors import ResultError
 from tk.io.results.reader import read_result
-from tk.io.results.revision import revise_result
 from tk.io.results.writer import ResultWriter
 from tk.model.body.skeleton import JOINTS
 

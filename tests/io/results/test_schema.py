@@ -6,9 +6,8 @@ from pathlib import Path
 
 import h5py
 
-from tests.io.result_files import make_cameras, make_smoothed, write
+from tests.io.result_files import make_cameras, make_smoothed, revise_result, write
 from tests.io.result_victim import META
-from tk.io.results.revision import revise_result
 from tk.io.results.schema import SCHEMA, Dataset, columns_of
 
 ROOT = Path(__file__).parents[3]

@@ -17,6 +17,7 @@ from tests.io.result_files import (
     assert_same_cameras,
     make_cameras,
     resume,
+    revise_result,
     write,
     write_truth,
 )
@@ -24,7 +25,6 @@ from tests.io.result_victim import META, make_frame, make_run, make_state
 from tk.errors import ResultError
 from tk.io.results.data import JointAngles, UsedCameras, Value
 from tk.io.results.reader import read_joints, read_result
-from tk.io.results.revision import revise_result
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
 from tk.model.body.anthropometry import BodyDimensions

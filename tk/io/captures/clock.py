@@ -23,9 +23,6 @@ from tk.io.toml import load_toml
 
 Float = NDArray[np.float64]
 
-#: relative difference from a nominal rate (30, or 30000/1001, which differ by 0.001) that is a camera's clock, not its
-#: rate: crystals differ by 1e-4 at most
-_CRYSTAL = 2e-4
 #: length of the mean of unit vectors, one for each image at its phase in the clock's intervals, above which a camera
 #: has a phase: 0.8 for a standard deviation of 0.1 intervals, 0.6 for a drift by half an interval
 _STEADY = 0.8
@@ -104,7 +101,7 @@ def choose_clock(
             f"to fps = {fps:g} of capture.toml; remove fps, or correct it; if the videos play in slow motion what was "
             f'recorded at {fps:g} frames/s, add times = "fps" and do not resample'
         )
-    fps = fps or min(_rate(each) for each in stamps)
+    fps = fps or min(nominal_rate(nominal_rate(each.own_rate), len(each.seconds)) for each in stamps)
     last_in = max(stamps, key=lambda each: float(each.since_start[0]))
     first_out = min(stamps, key=lambda each: float(each.since_start[-1]))
     begin, end = float(last_in.since_start[0]), float(first_out.since_start[-1])
@@ -148,13 +145,6 @@ def _limits(begin: float, end: float, span: Span, where: Path, warn: Callable[[s
         return low, span.empty[0]
     warn(f"{where}: the frames from {low:g} to {high:g} s include the empty scene, [background]; people are absent")
     return low, high
-
-
-def _rate(stamps: Stamps) -> float:
-    """Return a camera's rate, 1/s: the nominal one if it differs only by the camera's clock."""
-    rate = stamps.own_rate
-    nominal = min((round(rate), round(1.001 * rate) / 1.001), key=lambda near: abs(near - rate))
-    return nominal if abs(nominal - rate) < _CRYSTAL * rate else nominal_rate(rate, len(stamps.seconds))
 
 
 def _phase(stamps: Sequence[Stamps], low: float, high: float, fps: float) -> float:

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.io.captures.clip import Image
+from tk.io.captures.frames import AHEAD
 from tk.system.files import NamelessFile
 
 # Most frames of a second, and in all: every run pays the time for them.
@@ -30,8 +31,6 @@ _PLAIN = 500_000_000
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 90)  # appearance only
 #: bytes on the disk that are left to the result and its masks
 LEFT_FREE = 1_000_000_000
-# frames that are decoded ahead
-_AHEAD = 4
 
 
 def filmed(begin: int, stop: int, fps: float) -> range:
@@ -106,7 +105,7 @@ class Film:
             coming = deque[tuple[int, Callable[[], list[Image]]]]()
             for frame in frames:
                 coming.append((frame, thread.submit(self._read, places[frame]).result))
-                if len(coming) > _AHEAD:
+                if len(coming) > AHEAD:
                     frame, result = coming.popleft()
                     yield frame, result()
             for frame, result in coming:

@@ -19,7 +19,7 @@ from tk.io.captures.clip import Clip, Image, Reader
 from tk.model.masks.background import reduced
 
 #: most frames decoded ahead, and most bytes of them. Fewer make the consumer wait for a slow image.
-_AHEAD = 8
+AHEAD = 8
 _AHEAD_BYTES = 128_000_000
 
 
@@ -69,7 +69,7 @@ class FrameReader(Iterator[FrameSet]):
         """
         count = len(clips)
         self._wanted, self._fps, self._scheduled = wanted, fps, 0
-        ahead = max(2, min(_AHEAD, _AHEAD_BYTES // (count * math.prod(frame_shape) * (4 if mask_clips else 3))))
+        ahead = max(2, min(AHEAD, _AHEAD_BYTES // (count * math.prod(frame_shape) * (4 if mask_clips else 3))))
         self._images = _Stacks((count, *frame_shape, 3), ahead)
         self._masks = _Stacks((count, *frame_shape), ahead) if mask_clips else None
         stop = threading.Event()

@@ -28,18 +28,21 @@ from tk.model.setup import InitPose
 
 Float = NDArray[np.float64]
 
-_COCO_17 = {f"{joint}_{side}": 5 + 2 * k + s for k, joint in enumerate(LIMB_KINDS) for s, side in enumerate("lr")}
-_BODY_25 = {
-    f"{joint}_{side}": first + k % 3
-    for k, joint in enumerate(LIMB_KINDS)
-    for side, first in (("r", 2 if k < 3 else 9), ("l", 5 if k < 3 else 12))
-} | {"pelvis": 8}
+_COCO_17 = ("nose", "eye_l", "eye_r", "ear_l", "ear_r", *(f"{joint}_{side}" for joint in LIMB_KINDS for side in "lr"))
+_BODY_25 = (
+    *("nose", "neck", "shoulder_r", "elbow_r", "wrist_r", "shoulder_l", "elbow_l", "wrist_l"),
+    *("pelvis", "hip_r", "knee_r", "ankle_r", "hip_l", "knee_l", "ankle_l", "eye_r", "eye_l", "ear_r", "ear_l"),
+    *("toe_l", "small_toe_l", "heel_l", "toe_r", "small_toe_r", "heel_r"),
+)
+_HALPE_26 = (
+    *(*_COCO_17, "head_top", "neck", "pelvis"),
+    *("toe_l", "toe_r", "small_toe_l", "small_toe_r", "heel_l", "heel_r"),
+)
 #: index of each joint's keypoint, by the number of keypoints. Necks are left out: theirs lie lower, between the
 #: shoulders.
 LAYOUTS: Mapping[int, Mapping[str, int]] = {
-    17: _COCO_17,
-    25: _BODY_25,
-    26: {**_COCO_17, "head_top": 17, "pelvis": 19},
+    len(names): {name: k for k, name in enumerate(names) if name in JOINTS and name != "neck"}
+    for names in (_COCO_17, _BODY_25, _HALPE_26)
 }
 
 #: most people in an image, and most files in a folder; more are a mistake in the input

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 Plane = NDArray[Any]  # (h, w) uint8, or uint16 with 10 bits
 
-_FULL_RANGE = 2  # FFmpeg's AVCOL_RANGE_JPEG
 #: weights of red and blue in the brightness by FFmpeg's AVCOL_SPC; others, and videos that say nothing, are BT.601's
-_WEIGHTS = {1: (0.2126, 0.0722), 7: (0.212, 0.087), 9: (0.2627, 0.0593), 10: (0.2627, 0.0593)}
+_WEIGHTS = {1: (0.2126, 0.0722), 9: (0.2627, 0.0593)}
 _BT601 = (0.299, 0.114)
 #: largest side of a square of which the sum of 10 bits fits into 16
 _MOST_ADDED = 7
@@ -28,8 +27,10 @@ def read_reduced(image: Any, out: NDArray[np.uint8]) -> None:
 
     The size of the image is a multiple of that of ``out``.
     """
+    from av.video.reformatter import ColorRange
+
     ten_bits = image.format.name.endswith("10le")
-    full_range = image.color_range == _FULL_RANGE or image.format.name.startswith("yuvj")
+    full_range = image.color_range == ColorRange.JPEG or image.format.name.startswith("yuvj")
     size = out.shape[1], out.shape[0]
     planes = [_reduced(_values(plane, ten_bits), size) for plane in image.planes]
     if ten_bits:

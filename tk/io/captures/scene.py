@@ -10,17 +10,15 @@ import numpy as np
 from tk.errors import CalibrationError, VolumeError
 from tk.io.captures.calibration import Calibration
 from tk.io.captures.capture_toml import CaptureSettings
+from tk.io.captures.units import MOST_APART_M
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import all_look_away, infer_volume, sample_box, views_of
 from tk.model.cameras.mounting import DEFAULT_UP, FoundUp
 from tk.model.cameras.up import shown, up_vector
 from tk.model.cameras.volume import Volume
 
-#: if `capture.toml` gives no up direction, the default counts unless the cameras' mounting differs by more, degrees
-_UP_DEG = 25.0
-
-#: metres; a note asks for the unit if cameras are farther apart, because their positions may be in millimetres
-_FAR_APART_M = 100.0
+#: two up directions contradict each other if they differ by more, degrees
+UP_AGREE_DEG = 25.0
 
 
 def up_of(settings: CaptureSettings, found: FoundUp, path: Path, warn: Callable[[str], None]) -> str:
@@ -30,7 +28,7 @@ def up_of(settings: CaptureSettings, found: FoundUp, path: Path, warn: Callable[
     if not found.sure:
         warn(f'{path / "capture.toml"}: gives no up, and {found.how}; write up = "{found.up}" if it is right')
         return found.up
-    if up_vector(found.up) @ up_vector(DEFAULT_UP) > np.cos(np.radians(_UP_DEG)):
+    if up_vector(found.up) @ up_vector(DEFAULT_UP) > np.cos(np.radians(UP_AGREE_DEG)):
         return DEFAULT_UP
     warn(
         f"{path / 'capture.toml'}: gives no up; {shown(found.up)} is taken, {found.how}; "
@@ -65,5 +63,5 @@ def volume_of(settings: CaptureSettings, rig: Rig, path: Path, warn: Callable[[s
 def warn_of_units(calibration: Calibration, warn: Callable[[str], None]) -> None:
     """Add a note if the positions of the cameras look like millimetres."""
     centers = calibration.rig.centers
-    if np.linalg.norm(np.ptp(centers, axis=0)) > _FAR_APART_M:
-        warn(f'{calibration.path}: the cameras are over {_FAR_APART_M:g} m apart; is [metadata] units = "mm" missing?')
+    if np.linalg.norm(np.ptp(centers, axis=0)) > MOST_APART_M:
+        warn(f'{calibration.path}: the cameras are over {MOST_APART_M:g} m apart; is [metadata] units = "mm" missing?')

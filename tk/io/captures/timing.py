@@ -32,6 +32,9 @@ _GAP = 1.5
 #: share of an interval by which a nearest image may be farther away than half an interval: time stamps are rounded,
 #: often to milliseconds
 ROUNDED_INTERVAL = 0.05
+#: relative difference from a nominal rate (30, or 30000/1001, which differ by 0.001) that is a camera's clock, not its
+#: rate: crystals differ by 1e-4 at most
+_CRYSTAL = 2e-4
 
 
 @dataclass(frozen=True)
@@ -181,9 +184,10 @@ def _contradiction(message: str, resample: bool) -> ClockError:
     return ClockError(message, hint="or choose frames by their time stamps with --resample" if resample else "")
 
 
-def nominal_rate(fps: float, count: int) -> float:
-    """Return a whole rate, or 1000/1001 of one, if the measured rate differs only by rounded time stamps."""
+def nominal_rate(fps: float, count: int = 0) -> float:
+    """Return a whole rate, or 1000/1001 of one, if the measured rate differs only by the camera's clock; with a
+    ``count`` of time stamps, by their rounding."""
     for nominal in (round(fps), round(1.001 * fps) / 1.001):
-        if abs(nominal / fps - 1) * count < ROUNDED_INTERVAL:
+        if abs(nominal / fps - 1) < (ROUNDED_INTERVAL / count if count else _CRYSTAL):
             return float(nominal)
     return fps

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from tk.errors import CalibrationError
-from tk.io.importers.files import contains, matching, only, read_json
+from tk.io.importers.files import json_with, listed_cameras, only, read_json
 from tk.io.importers.project import Format, Tables
 from tk.io.toml import Table
 
@@ -25,14 +25,12 @@ _LENS = "libCalib::CameraModelOpenCV"
 _DISTORTIONS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
 
 #: bit of a `polymorphic_id` with which the file gives the name of a model; later cameras refer to the number alone
-_NAMED = 1 << 31
+_NAMED = 0x8000_0000
 
 
 def _read(files: Sequence[Path]) -> Tables:
     path = only(files)
-    listed = Table(read_json(path), str(path), CalibrationError).table("Calibration").values.get("cameras")
-    if not isinstance(listed, list) or not all(isinstance(item, Mapping) for item in listed):
-        raise CalibrationError(f"{path}: has no list of `cameras`")
+    listed = listed_cameras(Table(read_json(path), str(path), CalibrationError).table("Calibration").values, path)
     found = Tables(path)
     models: dict[int, str] = {}
     for index, item in enumerate(listed):
@@ -77,11 +75,7 @@ def _add(found: Tables, item: Mapping[str, Any], index: int, models: dict[int, s
     )
 
 
-def _find(root: Path) -> list[Path]:
-    found = matching(root, "*.json", "calibration/*.json")
-    return [path for path in found if contains(path, b'"Calibration"', b"libCalib::", b'"transform"')]
-
-
 FORMAT = Format(
-    "calib.io", ("*.json",), _read, videos=("videos", "images", "."), in_order=True, search=_find,
+    "calib.io", ("*.json",), _read, videos=("videos", "images", "."), in_order=True,
+    search=json_with(b'"Calibration"', b"libCalib::", b'"transform"'),
 )  # fmt: skip

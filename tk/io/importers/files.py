@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -49,6 +49,19 @@ def contains(path: Path, *words: bytes) -> bool:
     except OSError:
         return False
     return all(word in content for word in words)
+
+
+def json_with(*words: bytes) -> Callable[[Path], list[Path]]:
+    """Return a function that finds the JSON files of a project that contain all of these words."""
+    return lambda root: [path for path in matching(root, "*.json", "calibration/*.json") if contains(path, *words)]
+
+
+def listed_cameras(document: Mapping[str, Any], path: Path) -> list[Mapping[str, Any]]:
+    """Return the list of tables ``cameras`` in a document."""
+    listed = document.get("cameras")
+    if not isinstance(listed, list) or not all(isinstance(item, Mapping) for item in listed):
+        raise CalibrationError(f"{path}: has no list of `cameras`")
+    return listed
 
 
 def attributes(element: Element, where: str, words: Mapping[str, slice] = MappingProxyType({})) -> Table:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CalibrationError
-from tk.io.importers.files import contains, matching, only, read_json
+from tk.io.importers.files import json_with, only, read_json
 from tk.io.importers.project import Format, Tables
 from tk.io.toml import Table
 
@@ -71,9 +71,7 @@ def _poses(table: Table, names: Sequence[str]) -> dict[str, NDArray[np.float64]]
     return poses
 
 
-def _find(root: Path) -> list[Path]:
-    found = matching(root, "*.json", "calibration/*.json")
-    return [path for path in found if contains(path, b'"camera_poses"', b'"cameras"', b'"image_size"')]
-
-
-FORMAT = Format("multical", ("calibration.json",), _read, videos=("videos", "images", "."), search=_find)
+FORMAT = Format(
+    "multical", ("calibration.json",), _read, videos=("videos", "images", "."),
+    search=json_with(b'"camera_poses"', b'"cameras"', b'"image_size"'),
+)  # fmt: skip

@@ -83,9 +83,7 @@ def _cameras(documents: Sequence[tuple[Path, Mapping[str, Any]]]) -> Iterator[tu
         yield from cameras or [(path, "", None)]
 
 
-def _stereo(
-    documents: Sequence[tuple[Path, Mapping[str, Any]]],
-) -> list[tuple[str, Table, Any, Any]] | None:
+def _stereo(documents: Sequence[tuple[Path, Mapping[str, Any]]]) -> list[tuple[str, Table, Any, Any]] | None:
     """Return the two cameras of `stereoCalibrate` with their poses; None if the files are not of a pair."""
     merged: dict[str, Any] = {}
     for _, document in documents:

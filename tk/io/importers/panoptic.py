@@ -8,24 +8,21 @@ Lengths are centimetres; R and t map world to camera; the world's y axis points 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from tk.errors import CalibrationError
-from tk.io.importers.files import only, read_json
+from tk.io.importers.files import listed_cameras, only, read_json
 from tk.io.importers.project import Format, Tables
 from tk.io.toml import Table
 
 
 def _read(files: Sequence[Path]) -> Tables:
     path = only(files)
-    listed = read_json(path).get("cameras")
-    if not isinstance(listed, list) or not all(isinstance(item, Mapping) for item in listed):
-        raise CalibrationError(f"{path}: has no list of `cameras`")
     found = Tables(path, unit="cm", unit_from="the format")
-    for index, item in enumerate(listed):
+    for index, item in enumerate(listed_cameras(read_json(path), path)):
         name = Table(item, f"{path}: camera {index}", CalibrationError).text("name", "")
         table = Table(item, f"{path}: camera {name!r}", CalibrationError)
         found.add(

@@ -294,8 +294,7 @@ def _by_person(rig: Rig, source: Path) -> FoundUnit:
         f"{unit} ({wide * UNITS[unit]:.2g} m apart, views {view * UNITS[unit]:.2g} m high)" for unit in ("cm", "mm")
     ]
     raise CalibrationError(
-        f"{source}: the cameras may be in {' or '.join(sizes)}: give the unit",
-        hint="--units cm or --units mm",
+        f"{source}: the cameras may be in {' or '.join(sizes)}: give the unit", hint="--units cm or --units mm"
     )
 
 

@@ -21,15 +21,13 @@ from tk.errors import CalibrationError
 from tk.io.importers.files import child, matching, only, read_xml
 from tk.io.importers.project import Format, Tables
 from tk.io.importers.readings import choose, placed, to_camera, y_up
+from tk.io.paths import looks_like
 
 #: QTM's units per pixel
 _SUBPIXELS = 64.0
 
 #: a larger extent of the sensor is in 1/64 pixel: no camera has as many pixels, and none has as few in 1/64
 _LEAST_SUBPIXELS = 12_800
-
-#: bytes of a file in which its first camera is named
-_HEAD_BYTES = 4096
 
 #: readings of <transform>, QTM's first
 _READINGS = {
@@ -115,14 +113,7 @@ def _find(root: Path) -> list[Path]:
 
 
 def _is_calibration(path: Path) -> bool:
-    try:
-        if not path.is_file():
-            return False
-        with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
-    except OSError:
-        return False
-    return b"<calibration" in head and b"<camera" in head
+    return path.is_file() and looks_like(rb".*<calibration.*<camera")(path)
 
 
 FORMAT = Format("Qualisys", ("*.qca.txt",), read_tables, videos=(".", "videos", "Videos"), search=_find)

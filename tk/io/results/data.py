@@ -45,12 +45,7 @@ class JointAngles:
     def of_body(cls, pose_names: Sequence[str], landmarks: bool = True) -> tuple[JointAngles, ...]:
         """Return all joints, of a body with these degrees of freedom; ``landmarks``: whether they were used."""
         return tuple(
-            cls(
-                angles.joint,
-                angles.names,
-                angles.convention,
-                by_reason(angles.unmeasured(pose_names, landmarks)),
-            )
+            cls(angles.joint, angles.names, angles.convention, by_reason(angles.unmeasured(pose_names, landmarks)))
             for angles in ANGLES
         )
 

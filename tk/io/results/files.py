@@ -31,11 +31,7 @@ ANY_HDF5 = replace(RESULT, is_one=lambda _: True)
 
 
 def check_result_path(
-    path: Path,
-    force: bool,
-    resume: bool = False,
-    inputs: Sequence[Path | None] = (),
-    capture: Path | None = None,
+    path: Path, force: bool, resume: bool = False, inputs: Sequence[Path | None] = (), capture: Path | None = None
 ) -> None:
     """Check that a result may be written to the path.
 

@@ -87,20 +87,6 @@ def revise_people(
     return meta
 
 
-def revise_result(
-    path: str | os.PathLike[str],
-    columns: Mapping[str, ArrayLike] | None = None,
-    *,
-    smoothed: Mapping[str, ArrayLike] | None = None,
-    model: Mapping[str, Value] | None = None,
-    cameras: UsedCameras | None = None,
-    notes: Sequence[str] | None = None,
-    person: int = 0,
-) -> ResultMeta:
-    """Replace parts of the result of one person, see :class:`Revision` and :func:`revise_people`."""
-    return revise_people(path, {person: Revision(columns or {}, smoothed, model)}, cameras, notes)
-
-
 def _checked(known: Mapping[str, Column], values: Mapping[str, ArrayLike], rows: int) -> dict[str, NDArray[Any]]:
     """Return the values of datasets in their types; refuse unknown datasets and wrong shapes."""
     unknown = sorted(values.keys() - known.keys())
