@@ -13,6 +13,7 @@ the contour only, and the derivative by the pose needs no term for it.
 A hidden contour point, or a point without an edge, is an entry with ρ = 1 and no gradient (6.1.2).
 """
 
+from tk.kernels.columns import PAIR, SCALAR, VECTOR, columns
 from tk.kernels.kinematics import load_rotation, load_translation
 from tk.kernels.projection import project
 from tk.kernels.runtime import ti
@@ -20,8 +21,10 @@ from tk.kernels.vectors import cross, dot, norm_sqr, pulled, times, triple_in
 from tk.kernels.wrench import MOTION, WRENCH, add_direction, add_wrench
 
 # Columns of an entry. Points a and b are in the zero configuration, metres; target and unit normal in the image.
-POINT_A, POINT_B, LAST_DOF, CAMERA, TARGET, NORMAL = 0, 3, 6, 7, 8, 10
-INV_SIGMA2, STATE, SCALE, NU, ENTRY_NUMBERS = 12, 13, 14, 15, 16  # 1/σ² in 1/px²; SCALE: the entry's share of f
+# 1/σ² in 1/px²; SCALE: the entry's share of f.
+POINT_A, POINT_B, LAST_DOF, CAMERA, TARGET, NORMAL, INV_SIGMA2, STATE, SCALE, NU, ENTRY_NUMBERS = columns(
+    VECTOR, VECTOR, SCALAR, SCALAR, PAIR, PAIR, SCALAR, SCALAR, SCALAR, SCALAR
+)
 # States of an entry: padding, assigned, and a contour point that can have no edge.
 ABSENT, ASSIGNED, UNASSIGNABLE = range(3)
 

@@ -25,8 +25,8 @@ GREY = (29, 150, 77)
 """Weights of blue, green and red in the brightness (ITU-R BT.601, 256ths)."""
 
 # The results' planes.
-DIFFERENCE, COLLINEARITY, BRIGHT = range(3)
 PLANES = 3
+DIFFERENCE, COLLINEARITY, BRIGHT = range(PLANES)
 
 _MANTISSA_SHIFT = 20  # 23 bits of float32 mantissa less log2(STEPS_PER_OCTAVE)
 _LEVEL_ONE = 128  # the level of 1.0

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.kernels.columns import PAIR, SCALAR, TRANSFORM, columns
 from tk.kernels.kinematics import carried
 from tk.kernels.runtime import ti
 
@@ -12,9 +13,11 @@ from tk.kernels.runtime import ti
 NEAREST_M = 0.1
 # The parts that may hide a part are the bits of an int64.
 MOST_PARTS = 64
-# Columns of ``parts``: a, b, h, m of the shape (from 0), the 3×4 frame, CONE or ELLIPSOID, the last degree of freedom
-# above the part, its limb, its colour group, the last degree of freedom that its contours move.
-PART_FRAME, PART_KIND, PART_DOF, PART_LIMB, PART_GROUP, PART_MOVED = 4, 16, 17, 18, 19, 20
+# Columns of ``parts``: a, b, h, m of the shape, the 3×4 frame, CONE or ELLIPSOID, the last degree of freedom above the
+# part, its limb, its colour group, the last degree of freedom that its contours move.
+_SHAPE, PART_FRAME, PART_KIND, PART_DOF, PART_LIMB, PART_GROUP, PART_MOVED, _ = columns(
+    PAIR + PAIR, TRANSFORM, SCALAR, SCALAR, SCALAR, SCALAR, SCALAR
+)
 
 
 class ConeArrays(NamedTuple):

@@ -11,6 +11,7 @@ Scratch of B poses, V cameras, P parts and Q curves:
     of its image in pixels, the sign that turns its image's normal outwards, and the corners of a polyline in pixels.
 """
 
+from tk.kernels.columns import PAIR, SCALAR, TRANSFORM, VECTOR, columns
 from tk.kernels.cone_arrays import NEAREST_M, PART_LIMB, kind_of, place_part, shape_of
 from tk.kernels.cones import SIDE_B, curve_of, enclosing_radius, enter, interior_point, point_on
 from tk.kernels.kinematics import load_rotation, load_translation, store_frame
@@ -24,11 +25,10 @@ CHORDS = 12
 # A sample is hidden by another part where its ray enters that part's cross-section shrunk to this: neighbours touch at
 # a joint.
 HIDING_SHRINK = 0.95
-# Columns of ``placed`` after the frame.
-BALL, BALL_SQUARE, PLACED_NUMBERS = 12, 15, 16
+# Columns of ``placed``.
+_FRAME, BALL, BALL_SQUARE, PLACED_NUMBERS = columns(TRANSFORM, VECTOR, SCALAR)
 # Columns of ``outlines``.
-VISIBLE, PARAMETERS, LENGTH, SIGN, CORNERS = 0, 1, 3, 4, 5
-OUTLINE_NUMBERS = CORNERS + 2 * (CHORDS + 1)
+VISIBLE, PARAMETERS, LENGTH, SIGN, CORNERS, OUTLINE_NUMBERS = columns(SCALAR, PAIR, SCALAR, SCALAR, (CHORDS + 1) * PAIR)
 
 
 @ti.func

@@ -11,16 +11,17 @@ over the horizontal in the trunk's frame, which follows from its own angle and t
 
 import numpy as np
 
+from tk.kernels.columns import SCALAR, SPATIAL, TRANSFORM, VECTOR, columns
 from tk.kernels.runtime import ti
 from tk.kernels.vectors import cross, norm_sqr, product, times, triple
 
 # The arm's elevation u from a shoulder's first two angles, the arm being level in the zero configuration:
 # u = ARM_UP[0] cos(second) sin(first) + ARM_UP[1] sin(second).
 ARM_UP = (-np.sqrt(2 / 3), np.sqrt(1 / 3))
-# Columns of a tree: axis (from 0), point, rise, 1 where prismatic, parent. A launch pays up to 6 µs for each array.
-TREE_POINT, TREE_RISE, TREE_PRISMATIC, TREE_PARENT = 3, 6, 9, 10
-# Columns of ``joints``: frame (from 0) and twist.
-TWIST, JOINT_NUMBERS = 12, 18
+# Columns of a tree: axis, point, rise, 1 where prismatic, parent.
+_AXIS, TREE_POINT, TREE_RISE, TREE_PRISMATIC, TREE_PARENT, _ = columns(VECTOR, VECTOR, VECTOR, SCALAR, SCALAR)
+# Columns of ``joints``.
+_FRAME, TWIST, JOINT_NUMBERS = columns(TRANSFORM, SPATIAL)
 
 
 def pack_tree(

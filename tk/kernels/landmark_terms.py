@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.kernels.columns import SCALAR, TRANSFORM, VECTOR, columns
 from tk.kernels.kinematics import JOINT_NUMBERS, TWIST, forward_tree, load_rotation, load_translation, parent_of
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.taichi_internals import Launcher
@@ -23,9 +24,11 @@ Float = NDArray[np.float64]
 # are exchanged in an image, logarithms of the probabilities that an image shows the person and somebody else, factor of
 # the precisions, share of the likelihood that counts, least depth, metres, and 2π in full precision.
 WRONG, EXCHANGED, SHOWN, ELSEWHERE, PRECISION, INDEPENDENT, NEAREST, TURN = range(8)
-# Columns of ``cameras`` after the 3×4 transform: direction to the person. Of ``points`` after the place: the last
-# degree of freedom above it. Of ``bones``: the landmarks at both ends, and the share of the depth that is seen.
-_SIGHT, _DOF, _FROM, _TO, _SHARE = 12, 3, 0, 1, 2
+# Columns of ``cameras``: 3×4 transform, direction to the person. Of ``points``: place, the last degree of freedom above
+# it. Of ``bones``: the landmarks at both ends, and the share of the depth that is seen.
+_FRAME, _SIGHT, _ = columns(TRANSFORM, VECTOR)
+_PLACE, _DOF, _ = columns(VECTOR, SCALAR)
+_FROM, _TO, _SHARE = range(3)
 # Place of each element of a symmetric matrix (3, 3) in its upper triangle, row by row.
 _UPPER = (0, 1, 2), (1, 3, 4), (2, 4, 5)
 

@@ -1,5 +1,6 @@
 """Pairs of the objective: surface samples with voxels, voxels with pieces. For :mod:`tk.kernels.objective`."""
 
+from tk.kernels.columns import SCALAR, TRANSFORM, VECTOR, columns
 from tk.kernels.kinematics import load_rotation, load_translation, store_frame
 from tk.kernels.nearest import nearest_voxel
 from tk.kernels.pieces import PIECE_DOF, PIECE_NUMBERS, PIECE_SHAPE, place_piece, to_zero_configuration
@@ -8,14 +9,14 @@ from tk.kernels.superellipsoid import implicit, project
 from tk.kernels.vectors import cross, norm_sqr, times, transposed_times, triple, triple_in
 from tk.kernels.wrench import MOTION, WRENCH, add_wrench
 
-# Columns of a sample, after its position.
-SAMPLE_DOF, SAMPLE_PATCH, SAMPLE_BARRED = range(3, 6)
+# Columns of a sample.
+_POSITION, SAMPLE_DOF, SAMPLE_PATCH, SAMPLE_BARRED, _ = columns(VECTOR, SCALAR, SCALAR, SCALAR)
 # Columns of a piece, after those of PieceArrays. Its colour patches, a bit mask of 63, are in three numbers of 21 bits,
 # which a float32 represents exactly.
 PIECE_PART, PIECE_PATCHES = PIECE_NUMBERS, PIECE_NUMBERS + 1
 PATCH_BITS = 21
-# Columns of the scratch's rows of pieces, which follow the joints: after the 3×4 frame in the world a bounding sphere.
-SPHERE, SPHERE_RADIUS = 12, 15
+# Columns of the scratch's rows of pieces, which follow the joints: 3×4 frame in the world, bounding sphere.
+_FRAME, SPHERE, SPHERE_RADIUS, _ = columns(TRANSFORM, VECTOR, SCALAR)
 # A point is deep inside a piece where G (1 on the surface, growing linearly from the centre) is below this.
 BURIED = 0.8
 # Indices of the packed settings; the grid of tk.kernels.nearest follows from GRID on.

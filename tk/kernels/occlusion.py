@@ -12,6 +12,7 @@ The paper is silent about two cases. Here a point inside another piece (at the j
 only touch do not hide each other, or every seam of the model would flicker.
 """
 
+from tk.kernels.columns import SCALAR, TRANSFORM, VECTOR, columns
 from tk.kernels.kinematics import load_rotation, load_translation, store_frame
 from tk.kernels.pieces import PIECE_SHAPE, place_piece
 from tk.kernels.runtime import ti
@@ -23,10 +24,9 @@ DEPTH = 12
 # A ray within the outermost thousandth of a piece only touches it. Chosen; at 0 seams flicker by rounding.
 TOUCH = 1e-3
 
-# Columns of a placed piece, after its 3×4 transform to the world: the camera's centre in the piece's frame (3);
-# direction (3) of the bounding sphere from the camera, cosine of the half angle of its cone, and its least distance
-# from the camera.
-PLACED_CAMERA, PLACED_CONE, PLACED_NEAR, PLACED_NUMBERS = 12, 15, 19, 20
+# Columns of a placed piece: its transform to the world; the camera's centre in the piece's frame; direction of the
+# bounding sphere from the camera and cosine of the half angle of its cone; its least distance from the camera.
+_FRAME, PLACED_CAMERA, PLACED_CONE, PLACED_NEAR, PLACED_NUMBERS = columns(TRANSFORM, VECTOR, VECTOR + SCALAR, SCALAR)
 # The cone's cosine is lowered by this, for rounding: half a millimetre at the smallest of a body's pieces.
 _SLACK = 1e-6
 

@@ -5,12 +5,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.kernels.columns import PAIR, SCALAR, TRANSFORM, VECTOR, columns
 from tk.kernels.kinematics import carried, rotation_of, translation_of
 from tk.kernels.runtime import ti
 from tk.kernels.vectors import times
 
-# Columns of ``pieces``, after the 3×4 frame: a1 a2 a3 ε1 ε2 z_lower z_upper, and the last degree of freedom above.
-PIECE_SHAPE, PIECE_DOF, PIECE_NUMBERS = 12, 19, 20
+# Columns of ``pieces``: 3×4 frame, a1 a2 a3 ε1 ε2 z_lower z_upper, and the last degree of freedom above.
+_FRAME, PIECE_SHAPE, PIECE_DOF, PIECE_NUMBERS = columns(TRANSFORM, VECTOR + PAIR + PAIR, SCALAR)
 
 
 class PieceArrays(NamedTuple):

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.kernels.columns import PAIR, SCALAR, VECTOR, columns
 from tk.kernels.cone_arrays import NEAREST_M, PART_DOF, PART_GROUP, ConeArrays, group_of, kind_of, place_part, shape_of
 from tk.kernels.cones import capsule, enter_unit, extent, interior_point
 from tk.kernels.kinematics import (
@@ -36,7 +37,7 @@ from tk.kernels.vectors import norm2, norm_sqr, times
 MARGIN, BEND = 1.1, 1.5
 # Columns of a part's outline in an image: capsule's begin, axis, radius, and the radius across the axis; then the
 # camera's centre in the unit part, and the pixel of the part's middle.
-_BEGIN, _AXIS, _RADIUS, _ACROSS, _ORIGIN, _MIDDLE, _COLUMNS = 0, 2, 4, 5, 7, 10, 12
+_BEGIN, _AXIS, _RADIUS, _ACROSS, _ORIGIN, _MIDDLE, _COLUMNS = columns(PAIR, PAIR, SCALAR, PAIR, VECTOR, PAIR)
 # Columns of the packed settings: see Rays and costs(); 1 to write labels and depths.
 _STEP, _MOST_OUTSIDE, _EXPORT = range(3)
 # Depth of a ray that meets nothing, far beyond any volume.

@@ -49,9 +49,10 @@ from tk.kernels.wrench import (
 # Columns of an exported sample: see Edgels.
 _EXPORT = 13
 # Columns of the packed settings. SCALE: pixels of the full picture in one of this scale; the others: SearchSettings.
-_NUMBERS = tuple(range(13))
-SCALE, WINDOW, SPACING, AMBIGUOUS, TANGENTIAL, ROBUST, LOST, DISPLACED = _NUMBERS[:8]
-COLORS, MOST_SAMPLES, INTERIOR, EXPORT, RATIO = _NUMBERS[8:]
+(
+    SCALE, WINDOW, SPACING, AMBIGUOUS, TANGENTIAL, ROBUST, LOST,
+    DISPLACED, COLORS, MOST_SAMPLES, INTERIOR, EXPORT, RATIO,
+) = range(13)  # fmt: skip
 # Columns of ``sums``: cost, weight of the samples that found an edge, weight of all, steps made; then the gradient.
 COST, FOUND, ALL, STEPS, GRADIENT = range(5)
 

@@ -20,16 +20,17 @@ along the direction, and two wrenches, of the gradient and of the Hessian-vector
 of the inertia, row by row.
 """
 
+from tk.kernels.columns import SPATIAL
 from tk.kernels.kinematics import JOINT_NUMBERS, TWIST, parent_of
 from tk.kernels.runtime import ti
 from tk.kernels.vectors import cross, dot, norm_sqr, times, triple_in
 
-MOTION, WRENCH = JOINT_NUMBERS, JOINT_NUMBERS + 6
+MOTION, WRENCH = JOINT_NUMBERS, JOINT_NUMBERS + SPATIAL
 INERTIA = JOINT_NUMBERS
 INERTIA_NUMBERS = 21
 SCRATCH_NUMBERS = INERTIA + INERTIA_NUMBERS
 # After the inertia, in the scratch of a kernel that needs both: a wrench about the origin of the inertias.
-PULL, PULL_NUMBERS = SCRATCH_NUMBERS, 6
+PULL, PULL_NUMBERS = SCRATCH_NUMBERS, SPATIAL
 # After both, the inertia and the wrench of what one view shows of the segment.
 OF_VIEW, VIEW_NUMBERS = PULL + PULL_NUMBERS, INERTIA_NUMBERS + PULL_NUMBERS
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.body.joints import ARM, BODIES, BY_LANDMARKS, CROOK, ROWS, WAIST
+from tk.model.body.joints import ARM, BY_LANDMARKS, CROOK, DOF_NAMES, ROWS, WAIST
 from tk.model.body.rotations import decompose
 from tk.model.body.skeleton import SEGMENTS, Skeleton
 
@@ -152,8 +152,6 @@ def _sets() -> tuple[AngleSet, ...]:
 
 
 ANGLES: tuple[AngleSet, ...] = _sets()
-#: all degrees of freedom of the body
-DOF_NAMES = BODIES[0]
 #: why an angle is NaN in every frame
 UNMEASURED, UNSEEN = "the body has no degree of freedom for it", "only landmarks show it, and none were used"
 

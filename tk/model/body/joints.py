@@ -18,11 +18,11 @@ Float = NDArray[np.float64]
 
 _X, _Y, _Z = np.eye(3)
 # Zero configuration of the left arm (see tk.model.body.skeleton).
-ARM = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
-ARM_POLE = np.array([-1.0, 1.0, 1.0]) / np.sqrt(3)
+ARM = (_X + _Y) / np.sqrt(2)
+ARM_POLE = (_Y + _Z - _X) / np.sqrt(3)
 _ARM_RISE = np.cross(ARM, ARM_POLE)
 # An elbow at zero twist bends inward and up: forward when the arm hangs, inward when it is raised.
-CROOK = np.array([0.5, -0.5, np.sqrt(0.5)])
+CROOK = (_X - _Y) / 2 + np.sqrt(0.5) * _Z
 ELBOW_AXIS = np.cross(ARM, CROOK)
 
 # Height of the waist above the hip centres, as a share of the trunk's length: about L4, the middle of the lumbar spine.
@@ -87,6 +87,14 @@ def side_of(name: str) -> str:
     return name[-2:] if name.endswith(("_l", "_r")) else ""
 
 
+def _within(limit_deg: float) -> tuple[float, float]:
+    return -limit_deg, limit_deg
+
+
+def _origin(d: BodyDimensions) -> Float:
+    return np.zeros(3)
+
+
 def _shoulder(d: BodyDimensions) -> Float:
     return d.shoulder_half_width * _Y + (d.trunk - d.shoulder_drop) * _Z
 
@@ -130,27 +138,27 @@ _HEAD_TURN_DEG = 45.0
 # `offset_m`: length of the median offset in the trunk's frame, which `tk evaluate` removes, mean over both sides and
 # the recordings that docs/evaluation.md lists (`python -m scripts.joint_offsets`).
 _MIDDLE = (
-    Joint("torso", lambda d: np.zeros(3), turns="torso", dofs=(
+    Joint("torso", _origin, turns="torso", dofs=(
         Dof("x", _X, prismatic=True), Dof("y", _Y, prismatic=True), Dof("z", _Z, prismatic=True),
-        Dof("yaw", _Z), Dof("roll", _X, -80.0, 80.0), Dof("pitch", _Y),
+        Dof("yaw", _Z), Dof("roll", _X, *_within(80.0)), Dof("pitch", _Y),
     )),
     Joint("waist", lambda d: WAIST_HEIGHT * d.trunk * _Z, above="torso", turns="pelvis", dofs=(
-        Dof("roll", _X, -30.0, 30.0, straight_deg=_WAIST_DEG, added=True),
+        Dof("roll", _X, *_within(30.0), straight_deg=_WAIST_DEG, added=True),
         Dof("pitch", -_Y, -25.0, 50.0, straight_deg=_WAIST_DEG, added=True),
-        Dof("yaw", _Z, -35.0, 35.0, straight_deg=_WAIST_DEG, added=True),
+        Dof("yaw", _Z, *_within(35.0), straight_deg=_WAIST_DEG, added=True),
     )),
-    Joint("pelvis", lambda d: np.zeros(3), above="waist", carrier="pelvis", offset_m=0.017),
+    Joint("pelvis", _origin, above="waist", carrier="pelvis", offset_m=0.017),
     Joint("neck", _neck, above="torso", turns="head", chain="head", carrier="torso", bone_from="pelvis", dofs=(
-        Dof("pitch", _Y, -70.0, 65.0), Dof("yaw", _X, -50.0, 50.0),
-        Dof("roll", _Z, -80.0, 80.0, landmarks_deg=_HEAD_TURN_DEG, added=True),
+        Dof("pitch", _Y, -70.0, 65.0), Dof("yaw", _X, *_within(50.0)),
+        Dof("roll", _Z, *_within(80.0), landmarks_deg=_HEAD_TURN_DEG, added=True),
     ), offset_m=0.017),
     Joint("head_top", lambda d: _neck(d) + d.head * _Z, above="neck", chain="head", carrier="head", bone_from="neck",
           offset_m=0.020),
 )  # fmt: skip
 _ARM_ROWS = (
     Joint("shoulder", _shoulder, above="torso", turns="upper_arm", chain="arm", carrier="upper_arm", bone_from="neck",
-          dofs=(Dof("yaw", ARM_POLE, -180.0, 180.0), Dof("pitch", _ARM_RISE, -80.0, 80.0),
-                Dof("roll", ARM, -110.0, 110.0)), offset_m=0.011),
+          dofs=(Dof("yaw", ARM_POLE, *_within(180.0)), Dof("pitch", _ARM_RISE, *_within(80.0)),
+                Dof("roll", ARM, *_within(110.0))), offset_m=0.011),
     Joint("elbow", _elbow, above="shoulder", turns="forearm", chain="arm", carrier="upper_arm", bone_from="shoulder",
           dofs=(Dof("flexion", ELBOW_AXIS, -5.0, 155.0),), offset_m=0.016),
     Joint("wrist", lambda d: _elbow(d) + d.forearm * ARM, above="elbow", chain="arm", carrier="forearm",
@@ -158,7 +166,7 @@ _ARM_ROWS = (
 )  # fmt: skip
 _LEG_ROWS = (
     Joint("hip", _hip, above="waist", turns="thigh", chain="leg", carrier="pelvis", bone_from="pelvis",
-          dofs=(Dof("pitch", _Y, -150.0, 40.0), Dof("yaw", _X, -45.0, 80.0), Dof("roll", -_Z, -70.0, 70.0)),
+          dofs=(Dof("pitch", _Y, -150.0, 40.0), Dof("yaw", _X, -45.0, 80.0), Dof("roll", -_Z, *_within(70.0))),
           offset_m=0.019),
     Joint("knee", _knee, above="hip", turns="calf", chain="leg", carrier="thigh", bone_from="hip",
           dofs=(Dof("flexion", _Y, -10.0, 160.0),), offset_m=0.013),
@@ -204,12 +212,12 @@ REQUIRED_JOINTS = tuple(name for name in JOINTS if not ROWS[name].added)
 SEGMENTS = tuple(row.turns for added in (False, True) for row in TABLE if row.turns and row.is_added == added)
 #: names of the degrees of freedom of the bodies that results have: tk's body, the same in files written before the
 #: head turned, and the paper's body
-BODIES = tuple(
+BODIES = DOF_NAMES, _UNTURNED, PAPER_DOF_NAMES = tuple(
     tuple(name for row in TABLE for dof, name in zip(row.dofs, row.dof_names, strict=True) if has(dof))
     for has in (lambda _: True, lambda dof: np.isinf(dof.landmarks_deg), lambda dof: not dof.added)
 )
 #: those that only landmarks show
-BY_LANDMARKS = tuple(name for name in BODIES[0] if name not in BODIES[1])
+BY_LANDMARKS = tuple(name for name in DOF_NAMES if name not in _UNTURNED)
 #: the degrees of freedom with which the trunk leans
 LEANS = tuple(
     f"{row.name}_{dof.name}"
@@ -236,7 +244,9 @@ for _chain in CHAINS:
     if side_of(_chain):
         LIMBS[_chain] = (_names[0], _names[1], _names[2])
 #: hinges: the middle joint of each limb, with the joints before and after it
-HINGES = {LIMBS[limb][1]: LIMBS[limb][::2] for limb in ("leg_l", "leg_r", "arm_l", "arm_r")}
+HINGES = {
+    middle: (first, last) for first, middle, last in (LIMBS[limb] for limb in ("leg_l", "leg_r", "arm_l", "arm_r"))
+}
 #: kinds of hinges, with the names of both sides
 HINGE_KINDS = {
     name.removesuffix("_l"): (name, name.removesuffix("_l") + "_r") for name in HINGES if name.endswith("_l")
@@ -252,11 +262,9 @@ FOOT_SEGMENT = {"heel_l": "foot_l", "toe_l": "foot_l", "heel_r": "foot_r", "toe_
 #: the points of the feet, in the order of `/feet/position`
 FOOT_POINTS = tuple(FOOT_SEGMENT)
 
-HIPS, SHOULDERS, ANKLE_JOINTS = (
-    tuple(LIMBS[chain + side][k] for side in ("_l", "_r")) for chain, k in (("leg", 0), ("arm", 0), ("leg", 2))
-)
+HIPS, SHOULDERS, ANKLE_JOINTS = ((kind + "_l", kind + "_r") for kind in ("hip", "shoulder", "ankle"))
 #: the joint between trunk and pelvis
-WAIST = ROWS[HIPS[0]].above
+WAIST = ROWS["hip_l"].above
 
 
 def segment_below(joint: str) -> str:

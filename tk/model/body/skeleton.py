@@ -35,8 +35,10 @@ from tk.model.body.joints import (
     ARM_POLE,
     BODIES,
     CHAINS,
+    DOF_NAMES,
     HIPS,
     JOINTS,
+    PAPER_DOF_NAMES,
     ROWS,
     SEGMENTS,
     SHOULDERS,
@@ -51,16 +53,15 @@ __all__ = ["CHAINS", "JOINTS", "SEGMENTS"]
 
 Float = NDArray[np.float64]
 
-# Batches of few poses whose transforms are kept, and how many poses a batch has at most.
-REMEMBERED, REMEMBERED_POSES = 32, 32
+# The transforms of so many batches are kept, each of at most so many poses.
+REMEMBERED = 32
 # Poses of a recording that are placed at once: a pose needs 16 kB of temporary memory.
 _BLOCK = 1024
 # Up to so many poses are placed in few rounds of products, more of them with few products: a call takes as long as
 # about 50 products.
 _FEW = 8
 
-
-_AHEAD, _BEHIND = [1, 2, 0], [2, 0, 1]  # axes after and before each of the three
+_AHEAD, _BEHIND = (np.roll(range(3), step) for step in (-1, 1))  # axes after and before each of the three
 
 
 @dataclass(frozen=True)
@@ -158,7 +159,7 @@ class Skeleton:
     def transforms(self, pose: Float) -> Float:
         """Return the transforms T_k (..., D, 4, 4) after each degree of freedom of poses (..., D), float64."""
         pose = np.asarray(pose, dtype=np.float64)
-        if pose.size > REMEMBERED_POSES * pose.shape[-1]:
+        if pose.size > REMEMBERED * pose.shape[-1]:
             return self._transforms(pose)
         # joints, twists and directions of poses are asked for in turn, and the joints once more in the next frame
         key = pose.tobytes()
@@ -396,7 +397,7 @@ def build_skeleton(dimensions: BodyDimensions, up: str = "z", paper: bool = Fals
         up: see :func:`up_rotation`.
         paper: whether it has the paper's 24 degrees of freedom only: no waist, no ankles, and the head does not turn.
     """
-    return _build(dimensions, up, BODIES[-1] if paper else BODIES[0])
+    return _build(dimensions, up, PAPER_DOF_NAMES if paper else DOF_NAMES)
 
 
 def _build(dimensions: BodyDimensions, up: str, names: Sequence[str]) -> Skeleton:
@@ -453,5 +454,5 @@ def skeleton_of_names(names: Sequence[str], dimensions: BodyDimensions, up: str)
     """
     if tuple(names) in BODIES:
         return _build(dimensions, up, names)
-    different = sorted({*BODIES[0]} ^ {*names}) or ["other order"]
+    different = sorted({*DOF_NAMES} ^ {*names}) or ["other order"]
     raise ValueError(f"the pose vector is not one of this body ({different[0]})")
