@@ -5,8 +5,8 @@ masks → cleaned, scales → {contours → edgels along their normals → norma
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import zip_longest
@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError
 from tk.kernels.line_search import SearchSettings
-from tk.kernels.mask_values import PERSON
 from tk.kernels.silhouette import descend, normal_equations
 from tk.model.body.anthropometry import AVERAGE_BODY, BodyDimensions
 from tk.model.body.body_fit import INFORMATIVE_FRAMES, STATURE_DEVIATION, FittedBody, fit_body
@@ -29,7 +28,6 @@ from tk.model.body.skeleton import JOINTS, build_skeleton, convert_poses
 from tk.model.body.stored_body import body_values
 from tk.model.cameras.bundle import CORRELATION_PX
 from tk.model.cameras.camera import Rig
-from tk.model.cameras.common_view import spread_out
 from tk.model.cameras.landmark_agreement import consensus
 from tk.model.cameras.tracker_frame import TrackerFrame
 from tk.model.cues import landmarks
@@ -58,8 +56,6 @@ ESTIMATED_STATURE_DEVIATION = 0.05
 MOST_STATURE_RATIO = 1.35
 # Information of one pixel of contour, 1/px²: edgels err by 2 px. The unit of the contours' equations.
 INFORMATION = 1.0 / (2.0**2 * CORRELATION_PX)
-# Cameras that the search at the start uses, at most. The body is fitted with all of them.
-OPENING_CAMERAS = 8
 # Rows of the grid of rays: to screen many candidates of a limb, and to choose among few poses.
 COARSE_ROWS, FINE_ROWS = 54, 96
 LINE_SEARCH = SearchSettings()
@@ -229,9 +225,8 @@ class ContourFinder:
         begun, self._begun = self._begun, None
         if len(frames) == 1 or begun is None or not begun.serves(frames[0], subject):
             begun = self._begin(frames[0], pyramids[0], subject, len(frames) == 1)
-        with self._opening_cameras(frames, pyramids) as (some, silhouettes):
-            seen = [self.see(blind(f), pyramid=shown) for f, shown in zip(some, silhouettes, strict=True)]
-            hypotheses = find_person(self, seen, begun.rough, begun.found)
+        seen = [self.see(blind(f), pyramid=shown) for f, shown in zip(frames, pyramids, strict=True)]
+        hypotheses = find_person(self, seen, begun.rough, begun.found)
         if not self.contours.adapt or subject.body is not None:
             return np.asarray(hypotheses[0].poses[0])
         barefoot = (expected or begun.average).barefoot
@@ -253,33 +248,8 @@ class ContourFinder:
         self.take_body(subject.body or build_cone_body(average))
         if init is not None:
             rough = self.settle(pyramid, convert_poses(angles, given, self.body.skeleton)[None]).states[0]
-        with self._opening_cameras([frame], [pyramid]) as (some, silhouettes):
-            found = find_in(self, self.see(blind(some[0]), pyramid=silhouettes[0]), rough, alone)
+        found = find_in(self, self.see(blind(frame), pyramid=pyramid), rough, alone)
         return _Begun(frame.masks, subject, average, rough, found)
-
-    @contextmanager
-    def _opening_cameras(
-        self, frames: Sequence[Frame], pyramids: Sequence[Pyramid]
-    ) -> Iterator[tuple[Sequence[Frame], Sequence[Pyramid]]]:
-        """Use at most :data:`OPENING_CAMERAS` inside, those from the most different sides; yield their share."""
-        rig = self.world.rig
-        # a camera that sees nobody in the first frame is no use for the search
-        seeing = np.flatnonzero((pyramids[0].masks[0] >= PERSON).any(axis=(1, 2)))
-        if len(seeing) <= OPENING_CAMERAS:
-            yield frames, pyramids
-            return
-        p_centroid = centroid(rig, pyramids[0], frames[0].index)
-        chosen = seeing[spread_out(rig.centers[seeing], p_centroid, OPENING_CAMERAS)]
-        some = Rig(tuple(rig[c] for c in chosen))
-        if some.frame_shape != rig.frame_shape:  # their images would have another size
-            yield frames, pyramids
-            return
-        whole = self.views, self.coarse_grid, self.fine_grid
-        self.views, self.coarse_grid, self.fine_grid = Views(some), RayGrid(some, COARSE_ROWS), RayGrid(some, FINE_ROWS)
-        try:
-            yield [_only(frame, chosen) for frame in frames], [pyramid.of_views(chosen) for pyramid in pyramids]
-        finally:
-            self.views, self.coarse_grid, self.fine_grid = whole
 
     def _adapt(
         self,
@@ -486,11 +456,3 @@ def _stature(apparent: float, hull_m: float | None) -> float:
     """Return the stature by what the silhouettes' area suggests and the height of the visual hull, metres: clothes
     enlarge the silhouettes, raised arms the hull; who bends has a low hull."""
     return min(apparent, hull_m) if hull_m and apparent / hull_m < MOST_STATURE_RATIO else apparent
-
-
-def _only(frame: Frame, views: NDArray[np.intp]) -> Frame:
-    """Return a frame of some views, without images."""
-    uncertain = None if frame.uncertain is None else frame.uncertain[views]
-    sources = None if frame.sources is None else frame.sources[views]
-    images = np.empty((len(views), 0, 0, 3), np.uint8)
-    return replace(frame, images=images, masks=frame.masks[views], uncertain=uncertain, sources=sources)

@@ -13,7 +13,6 @@ from tk.model.cameras.common_view import (
     determine_depth,
     infer_volume,
     sample_box,
-    spread_out,
     views_of,
 )
 from tk.model.cameras.volume import Volume
@@ -85,13 +84,3 @@ def test_rig_without_a_common_view_is_refused() -> None:
     ]
     with pytest.raises(VolumeError, match="no region"):
         infer_volume(Rig(tuple(turned)))
-
-
-def test_cameras_are_chosen_from_the_most_different_sides() -> None:
-    angles = np.radians([0, 5, 90, 95, 180, 45])
-    centers = np.stack([4 * np.cos(angles), 4 * np.sin(angles), np.full(6, 1.0)], axis=1)
-    point = np.array([0.0, 0.0, 1.0])
-    assert spread_out(centers, point, 2).tolist() == [0, 2]  # not 180°, which sees the silhouette of 0°
-    assert spread_out(centers, point, 3).tolist() == [0, 2, 5]
-    assert spread_out(centers, point, 9).tolist() == list(range(6))
-    assert len(spread_out(centers[:0], point, 3)) == 0

@@ -156,24 +156,3 @@ def common_boxes(rig: Rig) -> Iterator[tuple[int, Volume]]:
 def _triple(values: Float) -> tuple[float, float, float]:
     x, y, z = (float(value) for value in values)
     return x, y, z
-
-
-def spread_out(centers: Float, point: Float, count: int) -> NDArray[np.intp]:
-    """Return the indices (K,) of at most ``count`` cameras that see a point from the most different sides, ascending.
-
-    Each camera after the first is the one with the largest angle to the nearest of those before. Opposite cameras count
-    as near: they see the same silhouette.
-
-    Args:
-        centers: (C, 3).
-        point: (3,).
-    """
-    rays = centers - point
-    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    alike = np.abs(rays @ rays.T)
-    chosen = [0] if len(rays) else []
-    while len(chosen) < min(count, len(rays)):
-        nearest = alike[:, chosen].max(axis=1)
-        nearest[chosen] = np.inf
-        chosen.append(int(nearest.argmin()))
-    return np.sort(np.array(chosen, np.intp))

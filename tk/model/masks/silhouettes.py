@@ -48,12 +48,6 @@ class Pyramid:
         measured = joined([frame.measured for frame in frames])
         return Pyramid((none,) * scale + (masks,), frames[0].sizes[: scale + 1], measured)
 
-    def of_views(self, views: NDArray[np.intp]) -> Pyramid:
-        """Return the scales of some views."""
-        measured = {name: values[..., views, :, :] for name, values in self.measured.items()}
-        masks, sizes = tuple(level[views] for level in self.masks), tuple(size[views] for size in self.sizes)
-        return Pyramid(masks, sizes, measured)
-
 
 class Views:
     """The cameras of a rig, packed for the kernels.
