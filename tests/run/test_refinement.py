@@ -302,7 +302,7 @@ def test_person_who_is_tracked_again_by_another_tracker_is_judged_as_in_the_firs
             return ((Frame(i, np.zeros((4, 6, 8, 3), np.uint8), np.stack(4 * [zeros])), {}) for i in range(begin, stop))
 
     class Jumping:
-        tracks_among_others = False
+        tracks_among_others, image_step = False, 1
 
         def step(self, frame: Frame) -> Estimate:
             at = np.full((15, 3), 9.0 if frame.index == 3 else 0.0)
