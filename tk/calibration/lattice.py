@@ -52,7 +52,16 @@ def find_lattice(grey: Grey, board: Board) -> tuple[Ids, Float] | None:
     if best is None:
         return None
     ids, pixels = best[0], _registered(grey, board, *best)
-    good = np.isfinite(pixels[:, 0])
+    ids, pixels = ids[np.isfinite(pixels[:, 0])], pixels[np.isfinite(pixels[:, 0])]
+    if len(ids) < 4:
+        return None
+    points = board.points[ids, :2]
+    onto, _ = cv2.findHomography(points, pixels, cv2.LMEDS)
+    if onto is None:
+        return None
+    off = np.linalg.norm(_through(onto, points) - pixels, axis=1)
+    beside = _through(onto, points + np.array([board.square_m, 0.0])) - _through(onto, points)
+    good = off < _STRAY * np.linalg.norm(beside, axis=1)
     return ids[good], pixels[good]
 
 
@@ -247,6 +256,8 @@ _STEPS = 6
 #: squares larger than this, pixels, are no plane's image within the window because of the lens; their corners are found
 #: on their own, away from markers
 _LARGE_PX = 64.0
+#: largest distance of a corner from the plane's image, share of a square
+_STRAY = 0.35
 
 
 def _registered(grey: Grey, board: Board, ids: Ids, pixels: Float) -> Float:

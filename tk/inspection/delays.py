@@ -12,8 +12,9 @@ from tk.model.masks.mask_agreement import Agreement, MaskAgreement
 
 #: largest shift of a video that is compared, frames; at the edge it is no optimum
 REACH = 6
-#: a video is delayed if shifting it reduces the share of its masks outside the hull to less than this share of itself
-_DELAY_GAIN = 0.5
+#: a video is delayed if shifting it reduces the share of its masks outside the hull to less than this share of itself,
+#: and that share without a shift is larger than the second value
+_DELAY_GAIN, _DELAY_LEAST = 0.5, 0.01
 
 
 def find_delays(
@@ -65,7 +66,7 @@ def _lowest(outside: NDArray[np.float64], area: NDArray[np.float64]) -> tuple[in
     best, middle = int(np.argmin(share)), len(share) // 2
     now, least = float(share[middle]), float(share[best])
     inside = 0 < best < len(share) - 1
-    mended = least < _DELAY_GAIN * now < np.inf
+    mended = _DELAY_LEAST < now < np.inf and least < _DELAY_GAIN * now
     return (best - middle, now - least) if inside and mended else (0, 0.0)
 
 
