@@ -191,13 +191,15 @@ def track_back(run: Run, landmarks: Mapping[int, Float], fps: float, false_alarm
         false_alarm: as for :func:`~tk.trackers.judgement.judge_frames`.
     """
     found: dict[int, Estimate] = {}
+    if not run.lost.any():
+        return found
+    tracker = run.tracker.with_cameras(run.tracker.world.rig_out(run.tracker.world.rig))
     lost, steps = run.lost, np.diff(run.frames)
     step = int(np.median(steps)) if len(steps) else 1
     for rows in np.split(np.arange(len(lost)), np.flatnonzero(steps > step) + 1):
         for last in np.flatnonzero(lost[rows[:-1]] & ~lost[rows[1:]]):
             after = list(takewhile(lambda row: not lost[row], rows[last + 1 : last + 1 + RECENT]))
             stretch = list(takewhile(lambda row: lost[row], rows[last::-1]))
-            tracker = run.tracker.with_cameras(run.tracker.world.rig_out(run.tracker.world.rig))
             tracker.start_at(run.poses[after[-1]])
             judge = FrameJudge(tracker, run.residual.shape[1], fps, false_alarm)
             for row in chain(reversed(after), stretch):

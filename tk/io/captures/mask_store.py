@@ -79,9 +79,8 @@ class MaskStore:
         while end + _HEAD.size <= whole:
             index, kind, size, *shape = _HEAD.unpack(file.read(_HEAD.size))
             begin = end + _HEAD.size
-            if not 0 < size <= whole - begin or min(shape) <= 0 or self._shapes.get(kind, tuple(shape)) != tuple(shape):
-                break
-            if not _is_whole(file.read(size), kind, shape):
+            known = kind in (_PERSON, _OTHERS, _COLORS) and self._shapes.get(kind, tuple(shape)) == tuple(shape)
+            if not (known and 0 < size <= whole - begin and min(shape) > 0 and _is_whole(file.read(size), kind, shape)):
                 break
             self._shapes[kind], self._places[index, kind], end = tuple(shape), (begin, size), begin + size
         file.truncate(end)
