@@ -27,6 +27,8 @@ _LIKELY = 4
 _SIZES = range(3, 15)
 #: mean distance of markers from their places on a board of the right size, share of a marker's side
 _FITS = 0.25
+#: images are searched at these shares of their size: blur disappears
+_SHRUNK = (0.5, 0.25, 0.125)
 #: boards with markers
 _MARKED = ("charuco", "aprilgrid")
 
@@ -78,7 +80,7 @@ def _mirrored(grey: Grey, board: Board) -> str | None:
 
 
 def _blurred(grey: Grey, board: Board) -> str | None:
-    for share in 0.5 ** np.arange(1, 4):  # smaller images are less blurred
+    for share in _SHRUNK:
         small = cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
         if detect(np.asarray(small, np.uint8), board) is not None:
             return (

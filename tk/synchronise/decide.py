@@ -18,8 +18,8 @@ Float = NDArray[np.float64]
 METHODS = ("cameras", "flash", "person", "sound", "timecode")
 #: names of the methods in tables
 SHOWN = {"cameras": "motion, known cameras", "person": "motion"}
-#: seconds that sound and pictures of a camera may differ: what devices add, 0.04, and a way of 10 m
-SKEW_S = 0.07
+#: seconds that sound and pictures of a camera may differ: what devices add, and a way of 10 m
+SKEW_S = 0.04 + 0.003 * 10
 #: seconds above which sound and pictures are not of one recording
 _OTHER_S = 0.25
 

@@ -29,7 +29,7 @@ _GOPRO = re.compile(r"G[HXSL](\d\d)(\d{4})$", re.IGNORECASE)
 #: seconds by which a chapter may be created later than the end of the one before: whole seconds, and writing files
 _CREATED_S = 5.0
 #: bytes at both ends by which files are compared
-_COMPARED = 65_536
+_COMPARED = 1 << 16
 _TIMECODE = re.compile(r"(\d\d):(\d\d):(\d\d)([:;.])(\d+)$")
 
 

@@ -97,7 +97,7 @@ def error(masks: np.ndarray) -> np.ndarray:
 @given(
     quaternion=st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1), scale=st.floats(0.01, 100)
 )
-@settings(max_examples=5)
+@settings(max_examples=15)
 def test_pairs_agree_in_every_world_and_unit(
     masks: np.ndarray, error: np.ndarray, quaternion: tuple, scale: float
 ) -> None:

@@ -26,8 +26,8 @@ _SINGULAR = 1e-9
 _MOST_PIXELS = 65_536
 #: largest delay of a video, seconds; a larger number is a mistake in the file
 _MOST_OFFSET_S = 3600.0
-#: range of the focal lengths, larger sides of the image
-_FOCAL_SIDES = (0.02, 1000.0)
+#: range of the focal lengths, larger sides of the image, and pixels if the size is unknown
+_FOCAL_SIDES, _FOCAL_PX = (0.02, 1000.0), (1.0, 1e7)
 #: largest skew, focal lengths: real ones are below 0.01; a larger one is another kind of matrix
 _MOST_SKEW = 0.3
 #: largest element of R Rᵀ - 1 of a rotation: files have six digits and more
@@ -279,12 +279,10 @@ def _matrix(table: Table, side_px: float) -> NDArray[np.float64]:
     if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or matrix[1, 0] != 0 or (matrix[2] != (0, 0, 1)).any():
         table.fail("matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive focal lengths")
     focal, skew = matrix[[0, 1], [0, 1]], matrix[0, 1]
-    least, most = np.array(_FOCAL_SIDES) * side_px
-    if side_px and ((focal < least).any() or (focal > most).any()):
-        table.fail(
-            f"matrix has focal lengths of {focal[0]:.4g} and {focal[1]:.4g} in an image of {side_px:g} pixels; they "
-            "must be in pixels"
-        )
+    least, most = np.array(_FOCAL_SIDES) * side_px if side_px else _FOCAL_PX
+    if (focal < least).any() or (focal > most).any():
+        image = f" in an image of {side_px:g} pixels" if side_px else ""
+        table.fail(f"matrix has focal lengths of {focal[0]:.4g} and {focal[1]:.4g}{image}; they must be in pixels")
     if abs(skew) > _MOST_SKEW * focal.min():
         table.fail(f"matrix has a skew of {skew:.4g} pixels; it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     return matrix

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 Plane = NDArray[Any]  # (h, w) uint8, or uint16 with 10 bits
 
 #: weights of red and blue in the brightness by FFmpeg's AVCOL_SPC; others, and videos that say nothing, are BT.601's
-_WEIGHTS = {1: (0.2126, 0.0722), 9: (0.2627, 0.0593)}
+_WEIGHTS = {1: (0.2126, 0.0722), 7: (0.212, 0.087), 9: (0.2627, 0.0593), 10: (0.2627, 0.0593)}
 _BT601 = (0.299, 0.114)
 #: largest side of a square of which the sum of 10 bits fits into 16
 _MOST_ADDED = 7

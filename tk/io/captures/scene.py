@@ -10,7 +10,6 @@ import numpy as np
 from tk.errors import CalibrationError, VolumeError
 from tk.io.captures.calibration import Calibration
 from tk.io.captures.capture_toml import CaptureSettings
-from tk.io.captures.units import MOST_APART_M
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import all_look_away, infer_volume, sample_box, views_of
 from tk.model.cameras.mounting import DEFAULT_UP, FoundUp
@@ -19,6 +18,9 @@ from tk.model.cameras.volume import Volume
 
 #: two up directions contradict each other if they differ by more, degrees
 UP_AGREE_DEG = 25.0
+
+#: metres; a note asks for the unit if cameras are farther apart, because their positions may be in millimetres
+_FAR_APART_M = 100.0
 
 
 def up_of(settings: CaptureSettings, found: FoundUp, path: Path, warn: Callable[[str], None]) -> str:
@@ -63,5 +65,5 @@ def volume_of(settings: CaptureSettings, rig: Rig, path: Path, warn: Callable[[s
 def warn_of_units(calibration: Calibration, warn: Callable[[str], None]) -> None:
     """Add a note if the positions of the cameras look like millimetres."""
     centers = calibration.rig.centers
-    if np.linalg.norm(np.ptp(centers, axis=0)) > MOST_APART_M:
-        warn(f'{calibration.path}: the cameras are over {MOST_APART_M:g} m apart; is [metadata] units = "mm" missing?')
+    if np.linalg.norm(np.ptp(centers, axis=0)) > _FAR_APART_M:
+        warn(f'{calibration.path}: the cameras are over {_FAR_APART_M:g} m apart; is [metadata] units = "mm" missing?')
