@@ -124,10 +124,13 @@ class Person(Stateful[PersonMotion]):
         return Answer(estimate, without_cameras(share, self.monitor.unfit), used)
 
     def shows_others(self, masks: NDArray[np.uint8], rig: Rig) -> bool:
-        """Return whether masks (C, H, W) show more than this person: pixels far from the last body."""
+        """Return whether masks (C, H, W) show more than this person, pixels far from the last body, or may do so, as
+        before the first frame."""
         tracker = sharing(self.tracker)
-        if tracker is None or self.lost or self.drawn is None or self.place is None:
+        if tracker is None or self.lost:
             return False
+        if self.drawn is None or self.place is None:
+            return True
         shown = tracker.coarse_grid.sample(masks) >= PERSON
         for camera, cells, body in zip(rig, shown, self.drawn, strict=True):
             area = np.count_nonzero(body)

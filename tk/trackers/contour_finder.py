@@ -41,19 +41,16 @@ from tk.optim.gauss_newton import BatchSolution, GaussNewtonSettings
 from tk.optim.quadratic import Quadratic
 from tk.settings import SilhouetteSettings
 from tk.trackers.hypotheses import PROPOSED, SAME_POSE_M, TrajectoryHypothesis, turning
-from tk.trackers.initialisation import Found, find_in, find_person, stature_of
+from tk.trackers.initialisation import MOST_STATURE_RATIO, Found, find_in, find_person, stature_of
 from tk.trackers.proposals import exchanged, limbs
 from tk.trackers.proposals.anywhere import centroid
 from tk.trackers.protocol import Frame
 
 Float = NDArray[np.float64]
 
-# Standard deviation of the logarithm of a stature that was estimated from the silhouettes: their areas err by 6 %.
+# Standard deviation of the logarithm of a stature that was estimated: areas of silhouettes err by 6 %, lengths between
+# landmarks by 2 % about a mean that is 4 % too small.
 ESTIMATED_STATURE_DEVIATION = 0.05
-# A given height is refused if the one that the silhouettes' area suggests differs by more than this factor. With true
-# heights the factor is 0.955 to 1.077 on nine recordings; children's proportions and wide clothes need more. A visual
-# hull that is lower by more than this shows a person who bends, so its height is no estimate of the stature.
-MOST_STATURE_RATIO = 1.35
 # Information of one pixel of contour, 1/px²: edgels err by 2 px. The unit of the contours' equations.
 INFORMATION = 1.0 / (2.0**2 * CORRELATION_PX)
 # Rows of the grid of rays: to screen many candidates of a limb, and to choose among few poses.
@@ -214,14 +211,15 @@ class ContourFinder:
         stature, expected = (init and init.height_m) or subject.height_m, None
         if init is None:
             centroid(self.views.rig, pyramids[0], frames[0].index)  # raises if nobody is there, before a body is taken
-            apparent = stature_of(self, pyramids[:: 6 if stature else 1])  # a check needs fewer frames
-            if stature and not 1 / MOST_STATURE_RATIO < apparent / stature < MOST_STATURE_RATIO:
-                raise CaptureError(
-                    f"the height of {stature:.2f} m contradicts the silhouettes, which show a person of about "
-                    f"{apparent:.2f} m: correct the height in capture.toml, or omit it; if it is right, "
-                    "calibration.toml has another unit or scale"
-                )
-            expected = BodyDimensions.from_stature(stature or _stature(apparent, subject.hull_m))
+            if stature:
+                apparent = stature_of(self, pyramids[::6])  # a check needs fewer frames
+                if not 1 / MOST_STATURE_RATIO < apparent / stature < MOST_STATURE_RATIO:
+                    raise CaptureError(
+                        f"the height of {stature:.2f} m contradicts the silhouettes, which show a person of about "
+                        f"{apparent:.2f} m: correct the height in capture.toml, or omit it; if it is right, "
+                        "calibration.toml has another unit or scale"
+                    )
+            expected = BodyDimensions.from_stature(stature or stature_of(self, pyramids, subject.hull_m))
         begun, self._begun = self._begun, None
         if len(frames) == 1 or begun is None or not begun.serves(frames[0], subject):
             begun = self._begin(frames[0], pyramids[0], subject, len(frames) == 1)
@@ -240,7 +238,7 @@ class ContourFinder:
         init, rough = subject.init, None
         if init is None:
             centroid(self.views.rig, pyramid, frame.index)  # raises if nobody is there
-            stature = subject.height_m or _stature(stature_of(self, [pyramid]), subject.hull_m)
+            stature = subject.height_m or stature_of(self, [pyramid], subject.hull_m)
             average = BodyDimensions.from_stature(stature)
         else:
             height_m = init.height_m or subject.height_m
@@ -450,9 +448,3 @@ class ContourFinder:
 def blind(frame: Frame) -> Frame:
     """Return the frame without images, for what does not use colours."""
     return replace(frame, images=frame.images[:0])
-
-
-def _stature(apparent: float, hull_m: float | None) -> float:
-    """Return the stature by what the silhouettes' area suggests and the height of the visual hull, metres: clothes
-    enlarge the silhouettes, raised arms the hull; who bends has a low hull."""
-    return min(apparent, hull_m) if hull_m and apparent / hull_m < MOST_STATURE_RATIO else apparent

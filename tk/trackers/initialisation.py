@@ -25,6 +25,7 @@ from tk.model.body.initial_pose import GREATEST_STATURE, LEAST_STATURE
 from tk.model.body.joints import HIPS, JOINTS, SHOULDERS
 from tk.model.body.limb_candidates import DISTINCT_M
 from tk.model.body.skeleton import Skeleton
+from tk.model.cues import landmarks as landmark_cue
 from tk.model.cues.ray_costs import Evidence
 from tk.model.masks.silhouettes import Pyramid
 from tk.model.setup import AVERAGE_STATURE_M
@@ -44,6 +45,10 @@ ANCHORS, CLEAR = 4, 0.2
 # Alternatives that are followed through the opening, the likeliest of each anchor first: where nothing fits, each takes
 # seconds.
 FOLLOWED = 8
+# A given height is refused if the stature that the frames show differs by more than this factor. With true heights the
+# factor is 0.92 to 1.077 on nine recordings; children's proportions and wide clothes need more. A visual hull that is
+# lower by more than this shows a person who bends, so its height is no estimate of the stature.
+MOST_STATURE_RATIO = 1.35
 #: the joints that a limb search does not move
 TRUNK = [JOINTS.index(name) for name in ("pelvis", "neck", *SHOULDERS, *HIPS)]
 
@@ -183,17 +188,28 @@ def _follow(
     return [TrajectoryHypothesis(one, float(mean)) for one, mean in zip(poses, means, strict=True)]
 
 
-def stature_of(finder: ContourFinder, pyramids: Sequence[Pyramid]) -> float:
-    """Return the stature, metres, at which an average body covers as many pixels as the silhouettes do.
+def stature_of(finder: ContourFinder, pyramids: Sequence[Pyramid], hull_m: float | None = None) -> float:
+    """Return the stature, metres, that frames show.
 
-    The area hardly changes when a person bends or raises the arms; the silhouette's height does. Girth and clothes
-    cause an error of about 6 %. Median over the views of all frames, against the mean area of hanging and spread arms.
+    Landmarks show it in any pose: median over the frames that have any. Without landmarks, it is the stature at which
+    an average body covers as many pixels as the silhouettes do: median over the views of all frames, against the mean
+    area of hanging and spread arms. The area hardly changes when a person bends or raises the arms. Clothes enlarge it,
+    raised arms enlarge the height of the visual hull; who bends has a low hull.
+
+    Args:
+        finder: of the cameras.
+        pyramids: of the frames.
+        hull_m: height of the visual hull in the first frame, metres, if known.
     """
+    rig = finder.views.rig
+    marked = [p.measured[landmark_cue.NAME] for p in pyramids if landmark_cue.NAME in p.measured]
+    if known := [found for seen in marked if (found := landmark_cue.stature(rig, seen)) is not None]:
+        return float(np.clip(np.median(known), LEAST_STATURE, GREATEST_STATURE))
     body: ConeBody = build_cone_body(AVERAGE_BODY)
     ratios: list[Float] = []
     for pyramid in pyramids:
         try:
-            p_centroid = centroid(finder.views.rig, pyramid, 0)
+            p_centroid = centroid(rig, pyramid, 0)
         except CaptureError:
             continue
         poses = gait.figures(body.skeleton, 4, 0, p_centroid)  # standing, and the Da Vinci pose
@@ -202,7 +218,8 @@ def stature_of(finder: ContourFinder, pyramids: Sequence[Pyramid]) -> float:
         drawn = met.label > 0 if evidence.others is None else (met.label > 0) & ~evidence.others
         covered = np.count_nonzero(drawn, axis=(2, 3)).mean(axis=0)
         seen = np.count_nonzero(evidence.person, axis=(1, 2))
-        known = (covered > 0) & (seen > 0)
-        ratios.append(seen[known] / covered[known])
+        shown = (covered > 0) & (seen > 0)
+        ratios.append(seen[shown] / covered[shown])
     ratio = float(np.median(np.concatenate(ratios))) if ratios else 1.0
-    return float(np.clip(AVERAGE_STATURE_M * np.sqrt(ratio), LEAST_STATURE, GREATEST_STATURE))
+    apparent = float(np.clip(AVERAGE_STATURE_M * np.sqrt(ratio), LEAST_STATURE, GREATEST_STATURE))
+    return min(apparent, hull_m) if hull_m and apparent / hull_m < MOST_STATURE_RATIO else apparent

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from tk.kernels.cone_arrays import NEAREST_M
 from tk.kernels.landmark_terms import LandmarkArrays, landmark_costs, landmark_information
 from tk.kernels.mask_values import PERSON
+from tk.model.body.anthropometry import AVERAGE_BODY
 from tk.model.body.body_points import LANDMARKS, POINTS, SEGMENT
 from tk.model.body.cone_body import ConeBody
 from tk.model.body.initial_pose import figures
@@ -80,7 +81,8 @@ _BONES = [("shoulder_l", "shoulder_r"), ("hip_l", "hip_r")] + [
 ]
 _FROM, _TO = np.array([[LANDMARKS.index(name) for name in bone] for bone in _BONES]).T
 _HALF = np.concatenate([_LOWER, _LOWER[_FROM]]).astype(np.int32)  # (L + K,) 0 the upper one
-_SHARE = np.where(np.arange(len(_BONES)) < 2, *DEPTH_SHARE)  # (K,)
+_ACROSS = 2  # of them, first, across the trunk
+_SHARE = np.where(np.arange(len(_BONES)) < _ACROSS, *DEPTH_SHARE)  # (K,)
 # (L + K, L) the landmarks and their bones as sums of landmarks; (L + K, L L) the products of these sums' factors.
 _PLACES = np.eye(len(LANDMARKS))
 _PLACES = np.concatenate([_PLACES, _SHARE[:, None] * (_PLACES[_TO] - _PLACES[_FROM])])
@@ -293,6 +295,19 @@ def propose(rig: Rig, body: ConeBody, seen: Float, p_near: Float) -> Float:
             step = np.linalg.solve(cost.matrix, cost.linear[..., None])[..., 0] - poses
             poses = skeleton.clip(poses + np.clip(step, -LONGEST_STEP, LONGEST_STEP))
     return np.asarray(poses[np.argsort(cue.cost(poses), kind="stable")])
+
+
+def stature(rig: Rig, seen: Float) -> float | None:
+    """Return the stature, metres, of the average body whose upper arms, forearms, thighs and calves are together as
+    long as those between triangulated landmarks (V, L, 4) of a frame; None if none of them is known.
+
+    It does not depend on the pose, as a height does.
+    """
+    found = triangulate_joints(rig, seen)[0]
+    average = np.array([POINTS[name].place(AVERAGE_BODY) for name in LANDMARKS])
+    length, expected = (np.linalg.norm(x[_TO] - x[_FROM], axis=1)[_ACROSS:] for x in (found, average))
+    known = np.isfinite(length)
+    return float(AVERAGE_STATURE_M * length[known].sum() / expected[known].sum()) if known.any() else None
 
 
 def points(body: ConeBody, pose: Float) -> Float:
