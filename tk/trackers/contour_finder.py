@@ -49,7 +49,7 @@ from tk.trackers.protocol import Frame
 Float = NDArray[np.float64]
 
 # Standard deviation of the logarithm of a stature that was estimated: areas of silhouettes err by 6 %, lengths between
-# landmarks by 2 % about a mean that is 4 % too small.
+# landmarks by 2 % about a mean that is 5 % too small.
 ESTIMATED_STATURE_DEVIATION = 0.05
 # Information of one pixel of contour, 1/px²: edgels err by 2 px. The unit of the contours' equations.
 INFORMATION = 1.0 / (2.0**2 * CORRELATION_PX)

@@ -191,7 +191,7 @@ def _follow(
 def stature_of(finder: ContourFinder, pyramids: Sequence[Pyramid], hull_m: float | None = None) -> float:
     """Return the stature, metres, that frames show.
 
-    Landmarks show it in any pose: median over the frames that have any. Without landmarks, it is the stature at which
+    Landmarks show it in any pose: median over the limbs in all frames. Without landmarks, it is the stature at which
     an average body covers as many pixels as the silhouettes do: median over the views of all frames, against the mean
     area of hanging and spread arms. The area hardly changes when a person bends or raises the arms. Clothes enlarge it,
     raised arms enlarge the height of the visual hull; who bends has a low hull.
@@ -202,8 +202,9 @@ def stature_of(finder: ContourFinder, pyramids: Sequence[Pyramid], hull_m: float
         hull_m: height of the visual hull in the first frame, metres, if known.
     """
     rig = finder.views.rig
-    marked = [p.measured[landmark_cue.NAME] for p in pyramids if landmark_cue.NAME in p.measured]
-    if known := [found for seen in marked if (found := landmark_cue.stature(rig, seen)) is not None]:
+    marked = [pyramid.measured.get(landmark_cue.NAME) for pyramid in pyramids]
+    by_limb = [landmark_cue.statures(rig, seen) for seen in marked if seen is not None]
+    if by_limb and len(known := np.concatenate(by_limb)):
         return float(np.clip(np.median(known), LEAST_STATURE, GREATEST_STATURE))
     body: ConeBody = build_cone_body(AVERAGE_BODY)
     ratios: list[Float] = []

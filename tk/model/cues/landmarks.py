@@ -297,17 +297,16 @@ def propose(rig: Rig, body: ConeBody, seen: Float, p_near: Float) -> Float:
     return np.asarray(poses[np.argsort(cue.cost(poses), kind="stable")])
 
 
-def stature(rig: Rig, seen: Float) -> float | None:
-    """Return the stature, metres, of the average body whose upper arms, forearms, thighs and calves are together as
-    long as those between triangulated landmarks (V, L, 4) of a frame; None if none of them is known.
+def statures(rig: Rig, seen: Float) -> Float:
+    """Return (K,) the statures, metres, of average bodies with each upper arm, forearm, thigh and calf as long as
+    between the triangulated landmarks (V, L, 4) of a frame, of those that are known.
 
-    It does not depend on the pose, as a height does.
+    They do not depend on the pose, as a height does.
     """
     found = triangulate_joints(rig, seen)[0]
     average = np.array([POINTS[name].place(AVERAGE_BODY) for name in LANDMARKS])
     length, expected = (np.linalg.norm(x[_TO] - x[_FROM], axis=1)[_ACROSS:] for x in (found, average))
-    known = np.isfinite(length)
-    return float(AVERAGE_STATURE_M * length[known].sum() / expected[known].sum()) if known.any() else None
+    return np.asarray(AVERAGE_STATURE_M * (length / expected)[np.isfinite(length)])
 
 
 def points(body: ConeBody, pose: Float) -> Float:
