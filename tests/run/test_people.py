@@ -11,6 +11,7 @@ import pytest
 from tests.people import RIG, person_mask, write_people
 from tk.errors import CaptureError
 from tk.io.captures.capture import open_capture
+from tk.kernels.mask_values import PERSON
 from tk.model.body.anthropometry import AVERAGE_BODY
 from tk.model.body.cone_body import build_cone_body
 from tk.model.setup import Subject
@@ -62,3 +63,17 @@ def test_somebody_who_cannot_be_tracked_does_not_end_the_run_of_others(tmp_path:
     assert people.start(opening)
     assert [person.number for person in people.written] == [0]
     assert sum("cannot be tracked: no pose explains the masks" in line for line in told) == 1
+
+
+def test_somebody_beside_the_volume_is_no_evidence_in_the_first_frame(tmp_path: Path) -> None:
+    """Nobody tracks the other person, who stands outside."""
+    capture = open_capture(write_people(tmp_path / "two", [lambda _: (-0.6, 0.0)], 1))
+    task = Task(capture.setup(), capture, TrackOptions())
+    people = People(task.setup, task.settings, "auto", RegionTracker.of(task.setup, task.settings), lambda _: None)
+    alone = np.stack([person_mask(camera, (-0.6, 0.0)) for camera in RIG])
+    masks = alone | np.stack([person_mask(camera, (1.5, 0.2)) for camera in RIG])
+    images = np.random.default_rng(1).integers(0, 255, (*masks.shape, 3), np.uint8)
+    opening = [Frame(0, images, masks)]
+    assert people.start(opening)
+    answer = people.step(opening[0])[0]
+    assert np.mean((answer.share.masks >= PERSON) != (alone >= PERSON)) < 0.1 * np.mean(alone >= PERSON)

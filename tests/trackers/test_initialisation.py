@@ -11,6 +11,7 @@ from tests.model.landmarks import landmarks_of
 from tests.model.ring import ring_of_cameras
 from tk.errors import CaptureError
 from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.body_points import LANDMARKS
 from tk.model.body.cone_body import build_cone_body
 from tk.model.body.gait_poses import neutral_pose, standing_pose, walking_pose
 from tk.model.body.skeleton import JOINTS, shoulder_angles
@@ -197,6 +198,21 @@ def test_lower_hull_corrects_the_stature_of_wide_clothes(monkeypatch, hull_m: fl
     tracker.find([frame], Subject(hull_m=hull_m))
     assert apparent > 1.1 * STATURE
     assert tracker.body.dimensions == BodyDimensions.from_stature(expected or apparent)
+
+
+@pytest.mark.parametrize("stature", [1.2, 1.6, 1.95])
+def test_landmarks_show_the_stature_of_somebody_who_sits_with_a_low_hull(stature: float) -> None:
+    """One wrist is seen somewhere else in each image."""
+    body = build_cone_body(BodyDimensions.from_stature(stature))
+    bent = {f"{name}_{side}": angle for name, angle in (("hip", -90.0), ("knee", 90.0)) for side in "lr"}
+    bent = {f"{limb}_{'pitch' if limb[:3] == 'hip' else 'flexion'}": angle for limb, angle in bent.items()}
+    pose = placed(standing_pose(SKELETON), 1.0, **bent)
+    seen = landmarks_of(RIG, body, pose, 0.015)
+    seen[:, LANDMARKS.index("wrist_l"), :2] = np.random.default_rng(1).uniform(0, 200, (len(RIG), 2))
+    masks = draw_silhouettes(body, RIG, pose[None])[0]
+    frame = Frame(0, np.zeros(0, np.uint8), masks, landmarks=seen[None])
+    tracker = tracker_of()
+    assert stature_of(tracker, [tracker.pyramid(frame)], 0.75 * stature) == pytest.approx(stature, rel=0.05)
 
 
 @pytest.mark.parametrize("height", [1.25, 2.4])
