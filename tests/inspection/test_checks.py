@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,15 +19,23 @@ from tests.io.conftest import write_picture, write_video
 from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tk.errors import CaptureError
+from tk.inspection.checks import inspect
 from tk.inspection.delays import best_shift
 from tk.inspection.leveling import Leveling, find_up, write_up
 from tk.io.captures.capture import open_capture
+from tk.io.captures.frames import FrameSet
+from tk.io.results.reader import read_joints
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.body_points import LANDMARKS
 from tk.model.body.cone_body import build_cone_body
+from tk.model.body.joints import JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.mounting import FoundUp, infer_up
 from tk.model.cameras.up import up_vector
+from tk.run.segmentation import Labeller, Labels, make_labeller
+from tk.run.task import Task
+from tk.settings import Settings
 
 
 def turn_camera(folder: Path, camera: int, degrees: float) -> None:
@@ -57,6 +66,37 @@ def test_turned_camera_is_named(tk: Tk, copy: Path) -> None:
     assert found["findings"][0].startswith("camera cam2 is inconsistent with the others: off by ")
     assert found["cameras"][1]["shift_px"] > 5 and found["cameras"][1]["outside"] > 0.1
     assert np.argmax([c["pairs_px"] for c in found["cameras"]]) == 1
+
+
+@pytest.mark.parametrize("wrong", ["mask", "camera"])
+def test_a_wrong_mask_blames_no_camera_whose_landmarks_agree(copy: Path, monkeypatch, wrong: str) -> None:
+    """The masks of cam2 show something else; or cam2 is turned, so that its landmarks contradict the others', too."""
+    rig, truth = open_capture(copy).rig, read_joints(copy / "truth.h5").positions
+
+    def labeller(task: Task, note: Callable[[str], None]) -> Labeller:
+        label = make_labeller(task, note)
+
+        def labelled(frame: FrameSet) -> Labels:
+            seen = np.full((1, len(rig), len(LANDMARKS), 4), np.nan)
+            for k, name in enumerate(LANDMARKS):
+                if name in JOINTS:
+                    points = truth[frame.index, JOINTS.index(name)][None]
+                    seen[0, :, k, :2] = [camera.project(points)[0][0] for camera in rig]
+                    seen[0, :, k, 2] = 0.95
+            found = label(frame)
+            if wrong == "mask":
+                found.masks[1] = np.roll(found.masks[1], 14, axis=1)
+            return found._replace(landmarks=seen)
+
+        return labelled
+
+    monkeypatch.setattr("tk.inspection.checks.make_labeller", labeller)
+    if wrong == "camera":
+        turn_camera(copy, 1, 6.0)
+    found, _ = inspect(open_capture(copy), Settings())
+    blamed = [line for line in found.findings if "cam2 is inconsistent" in line]
+    assert bool(blamed) == (wrong == "camera")
+    assert ("the landmarks of the cameras agree" in " ".join(found.findings)) == (wrong == "mask")
 
 
 def test_inspect_and_track_refuse_the_cameras_of_another_recording(

@@ -37,6 +37,7 @@ from tk.run.segmentation import make_labeller
 from tk.run.task import Task
 from tk.settings import Settings
 from tk.threads import one_thread
+from tk.trackers.camera_monitor import confirmed
 from tk.trackers.judgement import FAULTS
 
 Masks = NDArray[np.uint8]
@@ -90,6 +91,11 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
         if not (alone.refusal or alone.wrong or alone.disagreement > INCONSISTENT):
             # the others are people, not what a turned camera shows of one person
             masks, agreement = own, alone
+    bad = np.array([[i in images for images in read.bad_images] for i in frames.tolist()], np.bool_)
+    by_masks, agreement = (
+        agreement,
+        confirmed(agreement, capture.rig, [read.landmarks[i] for i in frames.tolist()], bad),
+    )
     late, sure = find_delays(compare, masks, centers, agreement)
     for c in () if sure else np.flatnonzero(late).tolist():
         notes.append(
@@ -123,7 +129,8 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
         for i in kept.tolist()
     ]
     moved = [line for i in kept[:1] for line in _moved_since_empty(capture, read.images[int(i)], masks[int(i)])]
-    findings = [*moved, *_findings(inspection, capture, agreement)]
+    denied = bool(by_masks.refusal or by_masks.wrong) and not (agreement.refusal or agreement.wrong)
+    findings = [*moved, *_findings(inspection, capture, agreement, denied)]
     if not agreement.wrong:  # a wrong camera makes one person look like several
         findings += many_people(people, entered)
     return replace(inspection, findings=tuple([unrelated, *findings] if unrelated else findings)), seen
@@ -134,14 +141,15 @@ class _Read:
     """What was read of a capture.
 
     Attributes:
-        masks: (C, H, W) by frame index. images: (C, H, W, 3) likewise, of fewer frames. small: masks and images at a
-            small size, of the frames of ``masks``.
+        masks: (C, H, W) by frame index. landmarks: (N, C, L, 4) of N people in these frames, if known. images:
+            (C, H, W, 3) likewise, of fewer frames. small: masks and images at a small size, of the frames of ``masks``.
         bad_images: of each camera, what is wrong with an image, by frame index.
         watch: has seen the people.
         notes: what the capture and the segmentation report.
     """
 
     masks: dict[int, Masks]
+    landmarks: dict[int, NDArray[np.float64] | None]
     images: dict[int, NDArray[np.uint8]]
     small: dict[int, Sampled]
     bad_images: tuple[dict[int, str], ...]
@@ -154,18 +162,18 @@ def _read(capture: Capture, config: Settings, span: range, compared: set[int], k
     images of those that are ``kept``."""
     notes = list(capture.warnings)
     label = make_labeller(Task.of(capture, config), notes.append)
-    read = _Read({}, {}, {}, tuple({} for _ in capture.rig), PeopleWatch(capture, span), notes)
+    read = _Read({}, {}, {}, {}, tuple({} for _ in capture.rig), PeopleWatch(capture, span), notes)
     health = ImageHealth()
     with capture.frames(span.start, span.stop) as reader:
         for frame in reader:
             i, watched = frame.index, read.watch.wants(frame.index)
             if not watched and i not in compared:
                 continue
-            labels, uncertain, *_ = label(frame)
+            labels, uncertain, _, landmarks, _ = label(frame)
             if watched:
                 read.watch.look(i, labels, uncertain)
             if i in compared:
-                read.masks[i] = labels.copy()
+                read.masks[i], read.landmarks[i] = labels.copy(), landmarks
                 read.small[i] = sampled(frame.images, labels)
                 for bad, reason in zip(read.bad_images, health.look(frame.images, read.masks[i]), strict=True):
                     if reason is not None:
@@ -250,10 +258,16 @@ def _moved_since_empty(capture: Capture, images: NDArray[np.uint8], masks: Masks
     return lines
 
 
-def _findings(found: Inspection, capture: Capture, agreement: Agreement) -> list[str]:
+def _findings(found: Inspection, capture: Capture, agreement: Agreement, denied: bool) -> list[str]:
+    """Return what is to be mended. ``denied``: the masks contradict each other, but the landmarks do not."""
     lines = [f"camera {c.name} is inconsistent with the others: {c.verdict}" for c in found.cameras if c.verdict]
     if agreement.refusal:
         lines.insert(0, agreement.refusal)
+    elif denied:
+        lines.append(
+            "the masks contradict each other, but the landmarks of the cameras agree: the masks show other people or "
+            "things, or miss parts of the person: look at them (-o DIR)"
+        )
     elif not lines and agreement.disagreement > INCONSISTENT:
         lines.append(
             f"the cameras are inconsistent, none more than the others: {agreement.disagreement:.0%} of the masks lie "

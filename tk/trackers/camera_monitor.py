@@ -21,6 +21,7 @@ from tk.errors import CaptureError
 from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.body.joint_sigma import CHANGING_M
 from tk.model.body.plausibility import check_extent, check_stature
+from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import determine_depth
 from tk.model.cameras.landmark_agreement import evidence_for_cameras
 from tk.model.cues.ray_costs import residual_of
@@ -69,21 +70,30 @@ def image_faults(frames: Sequence[Frame]) -> NDArray[np.bool_]:
 
 
 def opening_agreement(setup: Setup, frames: Sequence[Frame], bad: NDArray[np.bool_]) -> Agreement:
-    """Return whether the silhouettes of the opening frames agree.
-
-    A network's masks have holes and contain pieces of other things. A camera whose masks contradict the others is right
-    if its landmarks agree with the others'. ``bad``: (F, C) images that are not compared.
-    """
+    """Return whether the silhouettes of the opening frames agree. ``bad``: (F, C) images that are not compared."""
     rows = spread_over(range(len(frames)))
     found = MaskAgreement(setup.rig, setup.volume).compare([frames[i].masks for i in rows], ~bad[rows])
+    return confirmed(found, setup.rig, [frame.landmarks for frame in frames], bad)
+
+
+def confirmed(found: Agreement, rig: Rig, landmarks: Sequence[Float | None], bad: NDArray[np.bool_]) -> Agreement:
+    """Return the agreement of masks without contradictions that the landmarks deny.
+
+    A network's masks have holes and contain pieces of other things. A camera whose masks contradict the others is right
+    if its landmarks agree with the others'.
+
+    Args:
+        found: by the masks.
+        rig: C cameras.
+        landmarks: (N, C, L, 4) of N people in each of F frames, None where nothing is known.
+        bad: (F, C) images that are not compared.
+    """
     seen = [
-        np.where(wrong[:, None, None], np.nan, frame.landmarks)
-        for frame, wrong in zip(frames, bad, strict=True)
-        if frame.landmarks is not None
+        np.where(wrong[:, None, None], np.nan, marked)
+        for marked, wrong in zip(landmarks, bad, strict=True)
+        if marked is not None
     ]
-    if not seen or not (found.wrong or found.refusal):
-        return found
-    return found.confirmed(evidence_for_cameras(setup.rig, seen))
+    return found.confirmed(evidence_for_cameras(rig, seen)) if seen and (found.wrong or found.refusal) else found
 
 
 @dataclass(frozen=True)
