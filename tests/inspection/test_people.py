@@ -20,6 +20,7 @@ from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.people.find import LocatedPerson, PeopleFinder
+from tk.run.segmentation import Labels
 
 FRAMES = 24
 RIG = ring_of_cameras(4, 160, 120)
@@ -117,10 +118,10 @@ def test_people_are_numbered_in_the_order_in_which_they_enter_the_volume(
 ) -> None:
     first, second, third, never = 0.1, 0.5, 1.1, 2.5
     looks = iter([[never, 1.5, first], [never, 1.4, first, second]] + 20 * [[never, third, first, second]])
-    monkeypatch.setattr(PeopleFinder, "find", lambda *_: tuple(map(person, next(looks))))
+    monkeypatch.setattr(PeopleFinder, "find", lambda *_, **__: tuple(map(person, next(looks))))
     watch = PeopleWatch(open_capture(crossing), range(FRAMES))
     for index in filter(watch.wants, range(FRAMES)):
-        watch.look(index, np.zeros((4, 120, 160), np.uint8), None)
+        watch.look(index, Labels(np.zeros((4, 120, 160), np.uint8)))
     assert [(p.number, p.path[-1][0]) for p in watch.people()] == list(enumerate([first, second, third, never]))
     assert [p.enters for p in watch.people()] == [0, 3, 6, None]
 
@@ -131,8 +132,8 @@ def test_numbers_of_the_first_frame_stay_when_a_ghost_is_left_out(
     """`tk track` counts everybody who is found in the first frame."""
 
     looks = iter([(person(0.1), person(0.3), person(1.0))] + 20 * [(person(0.1), person(1.0))])
-    monkeypatch.setattr(PeopleFinder, "find", lambda *_: next(looks))
+    monkeypatch.setattr(PeopleFinder, "find", lambda *_, **__: next(looks))
     watch = PeopleWatch(open_capture(crossing), range(FRAMES))
     for index in filter(watch.wants, range(FRAMES)):
-        watch.look(index, np.zeros((4, 120, 160), np.uint8), None)
+        watch.look(index, Labels(np.zeros((4, 120, 160), np.uint8)))
     assert [(p.number, p.path[0][0]) for p in watch.people()] == [(0, 0.1), (2, 1.0)]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.model.figures import draw_silhouettes
+from tests.model.landmarks import landmarks_of
 from tests.model.ring import ring_of_cameras
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
@@ -163,6 +164,23 @@ def test_embraced_people_are_split_by_their_last_positions() -> None:
     assert len(found) == 2
     left, right = sorted(found, key=lambda person: person.position[0])
     assert left.position[0] < 0 < right.position[0]
+
+
+def test_embraced_people_are_split_where_landmarks_show_two() -> None:
+    """The landmarks of one person, seen twice, do not split."""
+    places, bodies = [(-0.16, 0.0), (0.16, 0.05)], []
+    masks = drawn(places).any(axis=0)
+    assert len(FINDER.find(masks)) == 1
+    for k, (x, y) in enumerate(places):
+        body = build_cone_body(BodyDimensions.from_stature(1.75))
+        pose = gait.walking_pose(body.skeleton, 0.3 * k)
+        pose[:3] = x, y, 0.54 * 1.75
+        bodies.append((body, pose))
+    first, second = (landmarks_of(RIG, body, pose, 0.02) for body, pose in bodies)
+    found = FINDER.find(masks, landmarks=np.stack([first, second]))
+    assert len(found) == 2 and max(nearest(found, places)) < 0.15
+    again = landmarks_of(RIG, *bodies[0], 0.02, seed=8)
+    assert len(FINDER.find(drawn(places)[0], landmarks=np.stack([first, again]))) == 1
 
 
 def test_person_at_the_place_of_someone_who_left_is_not_split() -> None:

@@ -86,7 +86,7 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
         centers = [i for i in centers if i - REACH >= entered] or centers
     agreement = compare.compare([masks[i] for i in frames.tolist()])
     if len(people) > 1:
-        own = {index: read.watch.of_first(index, m) for index, m in masks.items()}
+        own = {index: read.watch.of_first(index, m, read.landmarks[index]) for index, m in masks.items()}
         alone = compare.compare([own[i] for i in frames.tolist()])
         if not (alone.refusal or alone.wrong or alone.disagreement > INCONSISTENT):
             # the others are people, not what a turned camera shows of one person
@@ -169,12 +169,12 @@ def _read(capture: Capture, config: Settings, span: range, compared: set[int], k
             i, watched = frame.index, read.watch.wants(frame.index)
             if not watched and i not in compared:
                 continue
-            labels, uncertain, _, landmarks, _ = label(frame)
+            labels = label(frame)
             if watched:
-                read.watch.look(i, labels, uncertain)
+                read.watch.look(i, labels)
             if i in compared:
-                read.masks[i], read.landmarks[i] = labels.copy(), landmarks
-                read.small[i] = sampled(frame.images, labels)
+                read.masks[i], read.landmarks[i] = labels.masks.copy(), labels.landmarks
+                read.small[i] = sampled(frame.images, labels.masks)
                 for bad, reason in zip(read.bad_images, health.look(frame.images, read.masks[i]), strict=True):
                     if reason is not None:
                         bad[i] = FAULTS[reason].text

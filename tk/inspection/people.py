@@ -14,6 +14,7 @@ from tk.model.cues.ray_costs import RayGrid
 from tk.people.choose import in_order
 from tk.people.find import LocatedPerson, PeopleFinder
 from tk.people.hulls import owners_by_hulls
+from tk.run.segmentation import Labels
 from tk.trackers.contour_finder import FINE_ROWS
 from tk.trackers.protocol import Frame
 
@@ -112,20 +113,21 @@ class PeopleWatch:
         """Return whether to :meth:`look` at a frame."""
         return index >= self._start and (index - self._start) % self._every == 0
 
-    def look(self, index: int, masks: NDArray[np.uint8], uncertain: NDArray[np.bool_] | None) -> None:
-        """Find the people in a frame's masks (C, H, W), and assign them to the paths so far.
+    def look(self, index: int, labels: Labels) -> None:
+        """Find the people in what a frame shows, and assign them to the paths so far.
 
         The assignment has the least sum of distances on the way from the last positions (Kuhn 1955).
         """
+        masks, uncertain, landmarks = labels.masks, labels.uncertain, labels.landmarks
         self._looks += 1
         hidden = _HIDDEN_S * self._capture.fps
         self._open = [path for path in self._open if index - path.last[0] <= max(hidden, self._every)]
         near = [person for at, person in (path.last for path in self._open) if at == index - self._every]
-        found = self._finder.find(masks, uncertain, near)
+        found = self._finder.find(masks, uncertain, near, landmarks=landmarks)
         enter = self.entered is None and not self._finder.is_empty(masks, found)
         if enter:
             self.entered = index if index > self._start else 0
-            frame = Frame(index, np.empty((len(masks), 0, 0, 3), np.uint8), masks, uncertain)
+            frame = Frame(index, np.empty((len(masks), 0, 0, 3), np.uint8), masks, uncertain, landmarks=landmarks)
             found = in_order(self._finder, self._capture.setup(), [frame], found)
         before = np.array([path.last[1].position for path in self._open]).reshape(-1, 3)
         now = np.array([person.position for person in found]).reshape(-1, 3)
@@ -145,11 +147,12 @@ class PeopleWatch:
             # if cameras contradict each other, everybody may seem to be outside
             self._first = [taken[k] for k, person in enumerate(found) if person.inside or k == 0]
 
-    def of_first(self, index: int, masks: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the masks (C, H, W) of a frame with the pixels of everybody but person 0 as those of others."""
+    def of_first(self, index: int, masks: NDArray[np.uint8], landmarks: Float | None) -> NDArray[np.uint8]:
+        """Return the masks (C, H, W) of a frame, whose landmarks are (N, C, L, 4), with the pixels of everybody but
+        person 0 as those of others."""
         rig, path = self._capture.rig, self._numbered()[0].found
         last = min(path, key=lambda look: abs(look[0] - index))[1]
-        found = self._finder.find(masks)
+        found = self._finder.find(masks, landmarks=landmarks)
         by_distance = sorted(found, key=lambda person: float(np.linalg.norm(person.position - last.position)))
         grid = RayGrid(rig, FINE_ROWS)
         whole = Frame(index, np.empty((len(rig), 0, 0, 3), np.uint8), masks)

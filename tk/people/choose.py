@@ -51,7 +51,7 @@ def really_there(
         return found
     wrong = np.isin(np.arange(len(setup.rig)), agreement.wrong)
     frame = without_cameras(opening[0], wrong)
-    people = finder.find(frame.masks, frame.uncertain)
+    people = finder.find(frame.masks, frame.uncertain, landmarks=frame.landmarks)
     if len(people) == 1 and (_covered(setup.rig, opening[0].masks, people[0])[wrong] < _SHOWN).all():
         return people
     return found

@@ -16,7 +16,7 @@ from tk.model.hull.voxel_table import components
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 Near = Sequence[tuple[Float, float]]
-"""People of the last frame: position (3,) m, and volume of the hull, m³."""
+"""People of the last frame, or those whom landmarks show: position (3,) m, and volume of the hull, m³, or 0."""
 
 # Volume of a person's hull, litres, at most: of a man of 125 kg, whose hull may be twice as large. Components smaller
 # than a head (4 litres) are ignored.
@@ -25,7 +25,7 @@ _MOST_LITRES, _SPECK_LITRES = 250.0, 4.0
 # a crouching adult 0.6 m.
 _TRUNK_M = 0.5
 # Trunks of two people are at least so far apart, metres: the depth of a chest (0.25 m) and an error of a voxel.
-_APART_M = 0.3
+APART_M = 0.3
 # Standard deviation of the smoothed floor plan, metres: half of a trunk's depth.
 _SMOOTH_M = 0.1
 # Radius of a person's column in a block, metres: half the breadth of the shoulders, and a step.
@@ -69,7 +69,7 @@ class HullColumns:
             if len(whole) * self._litres >= _SPECK_LITRES:
                 middle = self.trunk(whole)
                 # a gap in the masks cuts a person in two; nobody stands above somebody else
-                above = [k for k, other in enumerate(wholes) if np.linalg.norm(self.trunk(other) - middle) < _APART_M]
+                above = [k for k, other in enumerate(wholes) if np.linalg.norm(self.trunk(other) - middle) < APART_M]
                 for k in reversed(above):
                     whole = np.concatenate([wholes.pop(k), whole])
                 wholes.append(whole)
@@ -107,7 +107,7 @@ class HullColumns:
         seeds = self._maxima(plan)
         if len(near) > len(seeds):
             at = [self._to_plan[:2] @ position - low for position, _ in near]
-            held = [np.linalg.norm(cell * self._grid.voxel_m - place, axis=1).min() < _APART_M for place in at]
+            held = [np.linalg.norm(cell * self._grid.voxel_m - place, axis=1).min() < APART_M for place in at]
             expected = sum(volume for (_, volume), holds in zip(near, held, strict=True) if holds)
             if sum(held) > len(seeds) and len(part) * self._litres >= 1000 * _TOGETHER * expected:
                 held_at = [place for place, holds in zip(at, held, strict=True) if holds]
@@ -143,7 +143,7 @@ class HullColumns:
         """
         edge = self._grid.voxel_m
         smooth = _blurred(plan, sigma_m / edge)
-        across = 2 * max(1, round(_APART_M / edge)) + 1
+        across = 2 * max(1, round(APART_M / edge)) + 1
         peaks = np.argwhere((smooth == cv2.dilate(smooth, np.ones((across, across)))) & (smooth >= _TRUNK_M))
         peaks = peaks[np.argsort(-smooth[tuple(peaks.T)], kind="stable")]
         kept: list[NDArray[np.int64]] = []

@@ -2,10 +2,10 @@
 
 Candidates are the connected components of the hull of all masks. Where they leave much of some masks unexplained, the
 components of these masks' hull are candidates, too: furniture may hide a person in the other cameras. A component with
-several upright columns is split into people. Where silhouettes of different people meet, the hull also contains
-ghosts: places where nobody is, although every mask shows somebody there. The people are the smallest set of candidates
-that explains the masks: the description length of pixels by people, minimised over all subsets. A ghost explains no
-pixel that a person does not.
+several upright columns is split into people, and so is one in which landmarks show several, who embrace. Where
+silhouettes of different people meet, the hull also contains ghosts: places where nobody is, although every mask shows
+somebody there. The people are the smallest set of candidates that explains the masks: the description length of pixels
+by people, minimised over all subsets. A ghost explains no pixel that a person does not.
 
 Sources: hull, Laurentini (1994); ghosts and their removal by occupancy and reprojection, Guan, Franco and Pollefeys,
 "Multi-view occlusion reasoning" (2008); choice of a set by description length, Rissanen (1978).
@@ -21,14 +21,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.mask_values import PERSON
+from tk.model.body.body_points import LANDMARKS
+from tk.model.body.joints import HIPS, SHOULDERS
 from tk.model.body.plausibility import STATURE_M
 from tk.model.body.skeleton import up_rotation
 from tk.model.cameras.camera import Rig
+from tk.model.cameras.landmark_agreement import consensus
 from tk.model.cameras.volume import Volume, VoxelGrid
 from tk.model.hull.coarse import Voxels, dilated
 from tk.model.hull.voxel_table import VoxelTable
 from tk.model.masks.sightings import BEYOND_M
-from tk.people.columns import MOST, HullColumns
+from tk.people.columns import APART_M, MOST, HullColumns, Near
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -58,6 +61,7 @@ _HEIGHT_STEP_M = 0.1
 # Half the width and half the height of the space in which one person is followed, metres; and how far this person may
 # move between frames.
 _HALF_M, _HALF_HEIGHT_M, _STEP_M = 0.9, 1.1, 0.4
+_TRUNK = [LANDMARKS.index(name) for name in (*SHOULDERS, *HIPS)]
 
 
 @dataclass(frozen=True)
@@ -143,6 +147,7 @@ class PeopleFinder:
         uncertain: Bool | None = None,
         near: Sequence[LocatedPerson] = (),
         hidden: Bool | None = None,
+        landmarks: Float | None = None,
     ) -> tuple[LocatedPerson, ...]:
         """Return the people, those in the working volume first, then by volume of their hull, the largest first.
 
@@ -156,17 +161,21 @@ class PeopleFinder:
                 lower a height.
             near: the people of the last frame. A component that holds the positions of several is split between them
                 if it is as large as they were together.
+            landmarks: (N, C, L, 4) of N people, see :mod:`tk.model.cues.landmarks`. A component that holds the trunks
+                of several is split between them.
         """
+        sighted = self._sighted(landmarks)
+        places = [(one.position, one.volume_m3) for one in near] if len(near) >= len(sighted) else sighted
         small = self._reduced(masks)
         unsure = small if uncertain is None else small | self._reduced(uncertain)
         seen = (small, unsure, unsure if hidden is None else unsure | self._reduced(hidden))
         known = [c for c in range(len(self.rig)) if small[c].any()]
-        found = self._candidates(seen, known, near)
+        found = self._candidates(seen, known, places)
         chosen = self._explaining(found, small)
         missed = np.flatnonzero(self._unexplained(small, chosen)).tolist()
         if 2 <= len(missed) < len(known):
             # only these cameras show somebody: he or she is hidden in the others, or their masks have a gap
-            chosen = self._explaining([*found, *self._candidates(seen, missed, near)], small)
+            chosen = self._explaining([*found, *self._candidates(seen, missed, places)], small)
         chosen = [*self._on_one_floor(chosen), *self._alone(small, self._covered(chosen))]
         return tuple(sorted(chosen, key=lambda person: (not person.inside, -np.nan_to_num(person.volume_m3))))
 
@@ -284,17 +293,27 @@ class PeopleFinder:
         offset = self._step // 2
         return np.asarray(masks[:, offset :: self._step, offset :: self._step] > 0)
 
-    def _candidates(
-        self, seen: tuple[Bool, Bool, Bool], cameras: Sequence[int], near: Sequence[LocatedPerson]
-    ) -> list[LocatedPerson]:
+    def _sighted(self, landmarks: Float | None) -> list[tuple[Float, float]]:
+        """Return the trunks (3,) of the people on whose landmarks, of (N, C, L, 4), two images agree, metres, with no
+        volume: how large their hulls are is unknown."""
+        places: list[tuple[Float, float]] = []
+        for seen in () if landmarks is None else landmarks:
+            trunk = consensus(self.rig, seen).points[_TRUNK]
+            if np.isfinite(trunk).all():
+                place = trunk.mean(axis=0)
+                if all(np.linalg.norm(place - other) >= APART_M for other, _ in places):
+                    places.append((place, 0.0))
+        return places
+
+    def _candidates(self, seen: tuple[Bool, Bool, Bool], cameras: Sequence[int], near: Near) -> list[LocatedPerson]:
         """Return who may be in the cameras' hull; the masks in reduced images (C, h, w), with the uncertain pixels,
-        and with the hidden ones, too."""
+        and with the hidden ones, too. ``near``: see :class:`~tk.people.columns.HullColumns`."""
         flat, self._voxels = self._table.near_hull(seen[0], seen[2], cameras)
         inside, unsure, allowed = (self._voxels.inside(masks) & self._voxels.sees for masks in seen)
         # each voxel of the hull is in two masks or more
         hull = (allowed[cameras] | ~self._voxels.sees[cameras]).all(axis=0) & (inside[cameras].sum(axis=0) >= 2)
         columns = HullColumns(self._grid, self._to_plan, self._voxels.centers, flat)
-        parts = columns.people(hull, [(person.position, person.volume_m3) for person in near])
+        parts = columns.people(hull, near)
         return [self._person(part, columns.trunk(part), inside, unsure) for part in parts]
 
     def _person(self, part: NDArray[np.int64], trunk: Float, inside: Bool, unsure: Bool) -> LocatedPerson:

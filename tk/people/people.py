@@ -135,7 +135,7 @@ class People:
     def locate(self, frame: Frame) -> tuple[LocatedPerson, ...]:
         """Return the people in a frame. :meth:`start` asks for those in its first frame, and takes them from here."""
         if self._located is None or self._located[0] is not frame:
-            self._located = frame, self._finder.find(frame.masks, frame.uncertain)
+            self._located = frame, self._finder.find(frame.masks, frame.uncertain, landmarks=frame.landmarks)
         return self._located[1]
 
     def anticipate(self, frame: Frame) -> None:
@@ -249,7 +249,8 @@ class People:
 
     def _several_in(self, opening: Sequence[Frame]) -> bool:
         """Return whether several people are found in some frame of the opening."""
-        return any(len(self._finder.find(f.masks, f.uncertain)) > 1 for f in spread_over(opening))
+        found = (self._finder.find(f.masks, f.uncertain, landmarks=f.landmarks) for f in spread_over(opening))
+        return any(len(people) > 1 for people in found)
 
     def _shares(self, people: Sequence[LocatedPerson], frames: Sequence[Frame]) -> list[list[Frame]]:
         """Return the observations of each person in consecutive frames, from the hulls in the first one."""
