@@ -19,12 +19,15 @@ from typing import TYPE_CHECKING, Any
 
 import hypothesis
 import pytest
+import tomli_w
 
 from scripts.synthetic.capture import Options, plan_capture, write_capture
 from tk.errors import TkError
 from tk.io import settings_file
 from tk.io.captures.capture import Capture
 from tk.io.captures.film import Film
+from tk.io.results.reader import read_joints
+from tk.model.body.skeleton import JOINTS
 from tk.run.reporter import Reporter
 from tk.run.task import RecordingOptions
 from tk.settings import Settings
@@ -199,6 +202,16 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_capture(plan_capture(Options(frames=FRAMES, cameras=4, size=(160, 120), seed=3)), folder, masks=True)
 
     return made_once(tmp_path_factory, "tiny", make)
+
+
+@pytest.fixture(scope="session")
+def facing(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file with the joints of the rendered capture's first frame. A run that is given it knows which way the person
+    faces, so its second pass is spared the comparison of both headings, which is most of it."""
+    path = tmp_path_factory.mktemp("poses") / "facing.toml"
+    joints = dict(zip(JOINTS, read_joints(tiny / "truth.h5").positions[0].tolist(), strict=True))
+    path.write_text(tomli_w.dumps({"joints": joints}), encoding="utf-8")
+    return path
 
 
 @pytest.fixture(params=["Linux", "portable"])

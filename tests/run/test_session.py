@@ -177,15 +177,13 @@ def test_only_the_same_command_is_resumed(
 
 
 def test_large_images_are_reduced_and_the_result_has_the_recorded_cameras(
-    tiny: Path, causal: Path, tmp_path: Path
+    tiny: Path, causal: Path, facing: Path, tmp_path: Path
 ) -> None:
     capture, half = open_capture(tiny), tmp_path / "half.h5"
     tall = capture.setup().person_pixels()
     config = replace(CONFIG, person_pixels=int(tall.min() / 2))
     reporter = Silent()
-    joints = dict(zip(JOINTS, read_joints(tiny / "truth.h5").positions[0].tolist(), strict=True))
     # at 30 pixels front and back look alike: changes of 1e-7 m exchanged them in one run of five
-    facing = pose_file(tmp_path / "pose.toml", {"joints": joints})
     conftest.track(capture, half, config, reporter, frames=(0, 2), causal=True, init_pose=facing)
     (line,) = [note for note in reporter.notes if "reduced size" in note]
     assert "all cameras at 1/2 (the person is about" in line
