@@ -21,7 +21,7 @@ from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.people.find import LocatedPerson, PeopleFinder
 
-FRAMES = 24
+FRAMES = 12
 RIG = ring_of_cameras(4, 160, 120)
 
 
