@@ -333,8 +333,8 @@ def test_requested_frames_are_tracked(tiny: Path) -> None:
 
 def test_masks_are_made_from_the_videos(tiny: Path, tmp_path: Path) -> None:
     path, capture = tmp_path / "r.h5", open_capture(tiny, masks="none")
-    assert conftest.track(capture, path, CONFIG, frames=(0, 2), causal=True).lost == 0
-    found, truth = read_result(path), read_joints(tiny / "truth.h5").positions[:2]
+    assert conftest.track(capture, path, CONFIG, frames=(0, 1), causal=True).lost == 0
+    found, truth = read_result(path), read_joints(tiny / "truth.h5").positions[:1]
     assert np.linalg.norm(found.joints - truth, axis=2).mean() < 0.1 and (found.timing["masks"] > 0).all()
 
 
