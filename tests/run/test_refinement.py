@@ -63,10 +63,10 @@ def with_turned_camera(tiny: Path, parent: Path, degrees: float) -> Path:
 
 
 @pytest.fixture(scope="module")
-def run(turned: Path, facing: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Silent]:
+def run(turned: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Silent]:
     """A result, and what was said."""
     path, reporter = tmp_path_factory.mktemp("results") / "result.h5", Silent()
-    options: dict[str, Any] = {"frames": (0, 11), "init_pose": facing}
+    options: dict[str, Any] = {"frames": (0, 11)}
     assert track(open_capture(turned), path, settings_file.from_toml(QUICK), reporter, **options).lost == 0
     return path, reporter
 
@@ -109,9 +109,7 @@ def test_reduced_images_refine_the_recorded_cameras(run: tuple[Path, Silent], tu
         np.testing.assert_allclose(refined.matrix, given.matrix, rtol=0.02)
 
 
-def test_cameras_that_were_moved_are_not_compared(
-    tiny: Path, facing: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cameras_that_were_moved_are_not_compared(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[np.ndarray] = []
 
     def compare(people: list[TrackedPerson], *_: Any) -> None:
@@ -120,14 +118,14 @@ def test_cameras_that_were_moved_are_not_compared(
 
     monkeypatch.setattr(finish, "compare_cameras", compare)
     monkeypatch.setattr(CameraMonitor, "moved", np.array([False, True, False, False]))
-    options: dict[str, Any] = {"frames": (0, 2), "init_pose": facing}
+    options: dict[str, Any] = {"frames": (0, 2)}
     track(open_capture(tiny), tmp_path / "moved.h5", settings_file.from_toml(QUICK), **options)
     assert (seen[0] == [True, False, True, True]).all()
 
 
 @pytest.mark.parametrize("better", [[True], [False, True]])
 def test_late_videos_are_tracked_again_unless_the_poses_follow(
-    better: list[bool], tiny: Path, facing: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    better: list[bool], tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With invented delays: which frames are tracked again, and that every frame keeps its row."""
     asked: list[np.ndarray] = []
@@ -146,7 +144,7 @@ def test_late_videos_are_tracked_again_unless_the_poses_follow(
     monkeypatch.setattr(finish, "explains_better", lambda *_: better.pop(0))
     monkeypatch.setattr(Capture, "frames", remember)
     path, reporter = tmp_path / "again.h5", Silent()
-    options: dict[str, Any] = {"frames": (2, 12), "init_pose": facing}
+    options: dict[str, Any] = {"frames": (2, 12)}
     assert track(open_capture(tiny), path, settings_file.from_toml(QUICK), reporter, **options).lost == 0
     assert [late.tolist() for late in asked] == [[0, 0, 0, 0], [0, 0, 1, -1]][: 1 + again]
     assert any("tracking again" in note for note in reporter.notes) == again
@@ -175,11 +173,9 @@ def test_delays_that_explain_the_images_worse_are_not_used(
     np.testing.assert_array_equal(result.joints, read_result(refined).joints)
 
 
-def test_excluded_camera_is_used_after_the_refinement(
-    turned_more: Path, tiny: Path, facing: Path, tmp_path: Path
-) -> None:
+def test_excluded_camera_is_used_after_the_refinement(turned_more: Path, tiny: Path, tmp_path: Path) -> None:
     path, reporter = tmp_path / "r.h5", Silent()
-    options: dict[str, Any] = {"frames": (0, 11), "init_pose": facing}
+    options: dict[str, Any] = {"frames": (0, 11)}
     track(open_capture(turned_more), path, settings_file.from_toml(FITTED), reporter, **options)
     assert any("cam2" in note and "left out of frames 0 to 10" in note for note in reporter.notes)
     assert "tracked again: no camera is left out" in reporter.notes
