@@ -17,7 +17,7 @@ import tk
 from tests.conftest import EVERY_FRAME, QUICK, Silent, refused, run_clock
 from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
-from tests.trackers.walker import BODY, STATURE, walk
+from tests.trackers.walker import BODY, NAMES, STATURE, walk
 from tk.errors import CaptureError, ConfigError
 from tk.io import settings_file
 from tk.io.captures.frames import FrameSet
@@ -26,7 +26,7 @@ from tk.io.results.reader import read_result
 from tk.io.results.status import Status
 from tk.model.body.angles import UNSEEN
 from tk.model.cameras.volume import Volume
-from tk.model.setup import Setup, Subject
+from tk.model.setup import InitPose, Setup, Subject
 from tk.run import offline
 from tk.run.draft import Draft
 from tk.run.session import estimates, track_task
@@ -232,6 +232,9 @@ JOINTS = np.array([[BODY.skeleton.joints(pose) for pose in poses] for poses in B
 FOUR = ring_of_cameras(4, width=160, height=200)
 MASKS = np.array([draw_silhouettes(BODY, FOUR, poses) for poses in BOTH])
 PAIR = replace(SETUP, rig=FOUR, subjects=(Subject(STATURE, body=BODY, in_init_pose=False),) * 2)
+# the same with their first poses, which saves the search for them
+FIRST = [InitPose({}, dict(zip(NAMES, poses[0], strict=True)), None, STATURE) for poses in BOTH]
+POSED = replace(PAIR, subjects=tuple(replace(PAIR.subjects[0], init=init) for init in FIRST))
 
 
 def far_off(joints: np.ndarray, person: int) -> float:
@@ -247,7 +250,7 @@ def test_silhouettes_of_the_pair_overlap() -> None:
 def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, ...]:
     """Both people, tracked in one go."""
     path = tmp_path_factory.mktemp("pair") / "r.h5"
-    track_task(task(PAIR, Rendered(MASKS.max(axis=0)), people="all"), path, Silent())
+    track_task(task(POSED, Rendered(MASKS.max(axis=0)), people="all"), path, Silent())
     return read_result(path).people
 
 
@@ -271,7 +274,7 @@ def test_a_run_stopped_among_the_frames_and_among_the_second_passes_is_finished(
         return finish_one(finisher, draft)
 
     def track(reporter: Silent, resume: bool = True) -> tuple[Result, ...]:
-        run = task(PAIR, Rendered(MASKS.max(axis=0)), frames=(0, COUNT), people="all")
+        run = task(POSED, Rendered(MASKS.max(axis=0)), frames=(0, COUNT), people="all")
         track_task(run, tmp_path / "r.h5", reporter, resume=resume)
         return read_result(tmp_path / "r.h5").people
 
