@@ -18,13 +18,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import hypothesis
+import numpy as np
 import pytest
+import tomli_w
 
 from scripts.synthetic.capture import Options, plan_capture, write_capture
 from tk.errors import TkError
 from tk.io import settings_file
 from tk.io.captures.capture import Capture
 from tk.io.captures.film import Film
+from tk.io.results.reader import read_joints
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.initial_pose import pose_of_joints
+from tk.model.body.skeleton import build_skeleton
 from tk.run.reporter import Reporter
 from tk.run.task import RecordingOptions
 from tk.settings import Settings
@@ -191,14 +197,49 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
         time.sleep(0.05)
 
 
+FIRST_POSE = 'init = "first.toml"\n'
+
+
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A rendered capture, read-only: 4 cameras of 160×120, :data:`FRAMES` frames, backgrounds, masks, truth."""
+    """A rendered capture, read-only: 4 cameras of 160×120, :data:`FRAMES` frames, backgrounds, masks, truth.
+
+    Its person's first pose is given. That spares each run the search for the person, and each second pass the
+    comparison of both headings, which takes more than half of it.
+    """
 
     def make(folder: Path) -> None:
         write_capture(plan_capture(Options(frames=FRAMES, cameras=4, size=(160, 120), seed=3)), folder, masks=True)
+        skeleton = build_skeleton(BodyDimensions.from_stature(1.75))
+        joints = read_joints(folder / "truth.h5").positions[0]
+        pose = pose_of_joints(skeleton, np.arange(len(joints)), joints)
+        values = np.where(skeleton.prismatic, pose, np.degrees(pose)).tolist()
+        first = {"frame": 0, "angles": dict(zip(skeleton.names, values, strict=True))}
+        (folder / "first.toml").write_text(tomli_w.dumps(first), encoding="utf-8")
+        text = (folder / "capture.toml").read_text(encoding="utf-8")
+        (folder / "capture.toml").write_text(text.replace("[subject]\n", f"[subject]\n{FIRST_POSE}"), encoding="utf-8")
 
     return made_once(tmp_path_factory, "tiny", make)
+
+
+@pytest.fixture(scope="session")
+def unposed(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The rendered capture, read-only, without the first pose: the person is searched for."""
+
+    def make(folder: Path) -> None:
+        without_first_pose(Path(shutil.copytree(tiny, folder)))
+
+    return made_once(tmp_path_factory, "unposed", make)
+
+
+def without_first_pose(folder: Path, *changes: tuple[str, str]) -> Path:
+    """Remove the first pose from a copy of the rendered capture, and replace texts in `capture.toml`."""
+    text = (folder / "capture.toml").read_text(encoding="utf-8")
+    for old, new in ((FIRST_POSE, ""), *changes):
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "capture.toml").write_text(text, encoding="utf-8")
+    return folder
 
 
 @pytest.fixture(params=["Linux", "portable"])

@@ -23,10 +23,9 @@ from tk.batch.jobs import DONE, FAILED, make_jobs
 from tk.batch.run import _finished
 from tk.batch.summary import write_summary
 from tk.batch.work import _errors, work
-from tk.errors import CaptureError, ConfigError, ResultBusyError, ResultError
+from tk.errors import CaptureError, ConfigError, ResultError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
-from tk.io.hdf5_writer import Hdf5Writer
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.skeleton import JOINTS, build_skeleton
 from tk.run.task import RecordingOptions
@@ -229,11 +228,6 @@ def test_two_batches_in_one_folder_are_refused(tk: Tk, tiny: Path, tmp_path: Pat
     jobs.mkdir(parents=True)
     with locked(jobs, AssertionError("in use")):
         tk("batch", tiny, "-o", tmp_path / "out").complaint("another tk batch uses it")
-
-
-def test_result_that_another_run_writes_is_busy(tmp_path: Path) -> None:
-    with Hdf5Writer(tmp_path / "r.h5"), pytest.raises(ResultBusyError):
-        Hdf5Writer(tmp_path / "r.h5")
 
 
 def test_failure_of_a_capture_has_the_hint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

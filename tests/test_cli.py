@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.conftest import FRAMES, QUICK, Tk
+from tests.conftest import FRAMES, QUICK, Tk, without_first_pose
 from tests.io.conftest import write_picture
 from tk import __version__
 from tk.io import settings_file
@@ -26,18 +26,18 @@ SIZE = (160, 120)
 # --- the main job -----------------------------------------------------------------------------------------------------
 
 
-def test_track_writes_a_complete_result(tk: Tk, tiny: Path, tmp_path: Path) -> None:
-    """Its options override the settings file, and each stage is printed before the first frame."""
+def test_track_writes_a_complete_result(tk: Tk, unposed: Path, tmp_path: Path) -> None:
+    """The person is searched for. Options override the settings file; stages are printed before the first frame."""
     folder = tmp_path / "results"
     folder.mkdir()
     result, settings = folder / "result.h5", tmp_path / "settings.toml"
     settings.write_text(f"seed = 3\n{QUICK}prediction = 0\n".replace("32", "40"), encoding="utf-8")
-    ran = tk("track", tiny, "-o", result, "--config", settings, "--frames", "2:6", "--seed", "5", "--voxels", "32")
+    ran = tk("track", unposed, "-o", result, "--config", settings, "--frames", "2:6", "--seed", "5", "--voxels", "32")
     assert ran.code == 0, ran.err
     assert ran.out == ""  # progress is no result
     lines = ran.err.splitlines()
     stages = [re.sub(r"^\[ *[\d.]+ s\] ", "", line) for line in lines]
-    assert stages[:2] == ["loading", f"opening {tiny}"]
+    assert stages[:2] == ["loading", f"opening {unposed}"]
     begun = next(i for i, line in enumerate(lines) if line.startswith("frame 2: "))
     assert any("finding the person in frame 0" in line for line in stages[:begun])
     assert all(line.isprintable() for line in lines)  # plain lines, no bar, because stderr is not a terminal
@@ -111,9 +111,8 @@ def test_demo_tracks_and_prints_the_accuracy(
 ) -> None:
     """With the last frames of a small capture instead of the one that ships, which has a slow test."""
     package, frames = tmp_path / "package", 4
-    settings = shutil.copytree(tiny, package / "data" / "demo") / "capture.toml"
-    text = settings.read_text(encoding="utf-8").replace("frame = 0", f"frame = {FRAMES - frames}")
-    settings.write_text(text.replace("da-vinci", "any"), encoding="utf-8")
+    changes = ("frame = 0", f"frame = {FRAMES - frames}"), ("da-vinci", "any")
+    without_first_pose(Path(shutil.copytree(tiny, package / "data" / "demo")), *changes)
     monkeypatch.setattr("importlib.resources.files", lambda name: package)
     monkeypatch.setattr("tk.commands.base.load_settings", lambda file, voxels: settings_file.from_toml(QUICK))
     ran = tk("demo", "-o", tmp_path / "demo.h5")
@@ -178,6 +177,10 @@ def _truncate(folder: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
+def _nobody(folder: Path) -> None:
+    _empty_masks(without_first_pose(folder))
+
+
 def _empty_masks(folder: Path) -> None:
     for path in (folder / "masks").rglob("*.png"):
         write_picture(path, np.zeros(SIZE[::-1], np.uint8))
@@ -196,7 +199,8 @@ SPOILT: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     "a text for a mask": (
         lambda folder: (folder / "masks/cam2/000000.png").write_text("white"), ["masks/cam2/000000.png"],
     ),
-    "nobody there": (_empty_masks, ["capture", "nobody could be tracked: the working volume is empty"]),
+    "nobody there": (_nobody, ["capture", "nobody could be tracked: the working volume is empty"]),
+    "nobody in the given pose": (_empty_masks, ["capture", "no mask of frame 0 shows anybody"]),
 }  # fmt: skip
 
 

@@ -28,7 +28,8 @@ def imports(node: ast.AST) -> Iterator[str]:
             whole = f"{node.module}.{alias.name}"
             yield from (name for name in (whole if whole in FILES else node.module,) if name in FILES)
     for child in ast.iter_child_nodes(node):
-        yield from imports(child)
+        if not isinstance(child, ast.expr):  # imports are statements
+            yield from imports(child)
 
 
 @functools.cache

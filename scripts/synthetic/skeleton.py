@@ -147,7 +147,8 @@ def rot_z(angle_rad: Float) -> Float:
 
 
 def _rotation(angle_rad: Float, i: int, j: int) -> Float:
-    matrix = np.tile(np.eye(3), (len(angle_rad), 1, 1))
+    matrix = np.zeros((len(angle_rad), 3, 3))
+    matrix[:, 3 - i - j, 3 - i - j] = 1.0
     cos, sin = np.cos(angle_rad), np.sin(angle_rad)
     matrix[:, i, i] = matrix[:, j, j] = cos
     matrix[:, i, j], matrix[:, j, i] = -sin, sin

@@ -22,7 +22,7 @@ from tk.model.body.cone_body import build_cone_body
 from tk.people.find import LocatedPerson, PeopleFinder
 from tk.run.segmentation import Labels
 
-FRAMES = 24
+FRAMES = 12
 RIG = ring_of_cameras(4, 160, 120)
 
 

@@ -193,7 +193,7 @@ def test_visible_points_are_those_that_ray_casting_sees():
     rig = Rig(tuple(camera_at(p) for p in ([3, 0, 1.2], [-1, 2.5, 1.8], [-2, -3, 0.6], [0.3, 0.2, 3.2])))
     kernel = ContourKernel(body.arrays, strips.angles, strips.normals, strips.piece, pack_cameras(rig))
     rng = np.random.default_rng(7)
-    poses = np.array([random_pose(body.skeleton, rng) for _ in range(10)])
+    poses = np.array([random_pose(body.skeleton, rng) for _ in range(5)])
     points = kernel(poses, np.tile(np.arange(0, len(strips.piece), 2), (len(poses), 1)))
     segment = np.array([SEGMENTS.index(piece.segment) for piece in body.pieces])
     agree = total = found_in_all = 0

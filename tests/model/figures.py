@@ -29,9 +29,21 @@ def surface_points(body: ConeBody, pose: np.ndarray, part: np.ndarray, unscaled:
     return (T[:, :3, :3] @ body.local(part, unscaled)[:, :, None])[:, :, 0] + T[:, :3, 3]
 
 
+_GRIDS: dict[int, RayGrid] = {}  # by rig, the last few; a grid keeps its rig alive
+
+
+def grid_of(rig: Rig) -> RayGrid:
+    """Return the rays of all pixels of a rig."""
+    if id(rig) not in _GRIDS:
+        if len(_GRIDS) > 4:
+            _GRIDS.clear()
+        _GRIDS[id(rig)] = RayGrid(rig, rig.frame_shape[0])
+    return _GRIDS[id(rig)]
+
+
 def draw_silhouettes(body: ConeBody, rig: Rig, poses: np.ndarray) -> np.ndarray:
     """Render silhouettes (B, V, H, W) of the body at poses (B, D), 0 or 255."""
-    grid = RayGrid(rig, rig.frame_shape[0])
+    grid = grid_of(rig)
     drawn = [grid.render(body, pose[None]).label[0] > 0 for pose in poses]  # one by one, to save memory
     return np.where(drawn, np.uint8(255), np.uint8(0))
 

@@ -16,11 +16,7 @@ from tk.run.reconstruction import reconstruct
 CONFIG = settings_file.from_toml(QUICK)
 
 
-def test_reconstructed_hull_equals_the_trackers(tk: Tk, tiny: Path, tmp_path: Path) -> None:
-    settings, tracked = tmp_path / "settings.toml", tmp_path / "tracked.h5"
-    settings.write_text(QUICK, encoding="utf-8")
-    ran = tk("track", tiny, "--method", "volumetric", "-o", tracked, "--config", settings, "--store-hull")
-    assert ran.code == 0, ran.err
+def test_reconstructed_hull_equals_the_trackers(tiny: Path, tracked: Path, tmp_path: Path) -> None:
     reporter = Silent()
     assert reconstruct(open_capture(tiny), tmp_path / "h.h5", CONFIG, reporter) == FRAMES
     assert reporter.frames == list(range(FRAMES)) and reporter.total == FRAMES

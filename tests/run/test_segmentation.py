@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from tests.conftest import QUICK, Silent, Tk
 from tests.people import HEIGHT, WIDTH, install, truth, write_people
+from tests.run.scarlet import Scarlet
 from tk.errors import CaptureError, ConfigError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
@@ -166,20 +167,21 @@ def test_masks_without_a_person_are_empty(tmp_path: Path, monkeypatch: pytest.Mo
 # --------------------------------------------------------------------------------------------------------- tk masks
 
 
-def test_track_uses_given_masks(tk: Tk, walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_track_uses_given_masks(tk: Tk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(tmp_path / "site", monkeypatch, red="Finding")
+    walk, frames = write_people(tmp_path / "walk", [walking, bystander], 6), 6
     out = tmp_path / "made"
-    ran = tk("masks", walk, "-o", out, "--frames", ":5")
-    assert ran.code == 0 and "masks of 5 frames" in ran.err
+    ran = tk("masks", walk, "-o", out, "--frames", ":4")
+    assert ran.code == 0 and "masks of 4 frames" in ran.err
     first = (out / "c1" / "000002.png").read_bytes()
     (out / "c2" / "000003.png").unlink()
     (out / "c1" / "000002.png").write_bytes(b"kept")
     ran = tk("masks", walk, "-o", out, "--segmenter", "red")
-    assert ran.code == 0 and "masks of 20 frames" in ran.err and "16 of them new" in ran.err
+    assert ran.code == 0 and f"masks of {frames} frames" in ran.err and "3 of them new" in ran.err
     assert (out / "c1" / "000002.png").read_bytes() == b"kept"
     (out / "c1" / "000002.png").write_bytes(first)
     capture = open_capture(walk, masks=str(out))
-    assert capture.frame_count == FRAMES
+    assert capture.frame_count == frames
     with capture.frames() as frames:
         for frame in frames:
             assert frame.masks is not None
@@ -202,14 +204,6 @@ def test_masks_of_the_masks_command_are_used(
     tk(*command, "red", "--cameras", "c0,c1").complaint("cameras")
     tk("masks", walk, "-o", walk).complaint(str(walk), "choose another folder")
     tk(*command, "green").complaint("segmenter green", "is not installed")
-
-
-class Scarlet:
-    """A segmenter of a script: what is red is the person."""
-
-    def segment(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        blue, green, red = np.moveaxis(image.astype(np.float32), 2, 0)
-        return (red > 1.5 * np.maximum(blue, green) + 20).astype(np.float32)
 
 
 @pytest.mark.usefixtures("alone")

@@ -17,7 +17,7 @@ import tk
 from tests.conftest import EVERY_FRAME, QUICK, Silent, refused, run_clock
 from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
-from tests.trackers.walker import BODY, STATURE, walk
+from tests.trackers.walker import BODY, NAMES, STATURE, walk
 from tk.errors import CaptureError, ConfigError
 from tk.io import settings_file
 from tk.io.captures.frames import FrameSet
@@ -26,7 +26,7 @@ from tk.io.results.reader import read_result
 from tk.io.results.status import Status
 from tk.model.body.angles import UNSEEN
 from tk.model.cameras.volume import Volume
-from tk.model.setup import Setup, Subject
+from tk.model.setup import InitPose, Setup, Subject
 from tk.run import offline
 from tk.run.draft import Draft
 from tk.run.session import estimates, track_task
@@ -35,7 +35,11 @@ from tk.trackers.protocol import Estimate, Frame
 from tk.trackers.region import RegionTracker
 
 SETTINGS = settings_file.from_toml(QUICK.replace("init_frames = 3", "init_frames = 1"))
-ONE_POSE = replace(SETTINGS, region=replace(SETTINGS.region, hypotheses=1))
+ONE_POSE = replace(
+    SETTINGS,
+    region=replace(SETTINGS.region, hypotheses=1),
+    silhouette=replace(SETTINGS.silhouette, search_every=0.0),
+)
 RIG = ring_of_cameras(3, width=160, height=200)
 POSES = walk(5)
 SETUP = Setup(RIG, Volume((0.0, 0.0, 1.0), (3.0, 3.0, 2.2)), "z", 15.0, (Subject(STATURE, body=BODY),))
@@ -228,6 +232,9 @@ JOINTS = np.array([[BODY.skeleton.joints(pose) for pose in poses] for poses in B
 FOUR = ring_of_cameras(4, width=160, height=200)
 MASKS = np.array([draw_silhouettes(BODY, FOUR, poses) for poses in BOTH])
 PAIR = replace(SETUP, rig=FOUR, subjects=(Subject(STATURE, body=BODY, in_init_pose=False),) * 2)
+# the same with their first poses, which saves the search for them
+FIRST = [InitPose({}, dict(zip(NAMES, poses[0], strict=True)), None, STATURE) for poses in BOTH]
+POSED = replace(PAIR, subjects=tuple(replace(PAIR.subjects[0], init=init) for init in FIRST))
 
 
 def far_off(joints: np.ndarray, person: int) -> float:
@@ -243,7 +250,7 @@ def test_silhouettes_of_the_pair_overlap() -> None:
 def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, ...]:
     """Both people, tracked in one go."""
     path = tmp_path_factory.mktemp("pair") / "r.h5"
-    track_task(task(PAIR, Rendered(MASKS.max(axis=0)), people="all"), path, Silent())
+    track_task(task(POSED, Rendered(MASKS.max(axis=0)), people="all"), path, Silent())
     return read_result(path).people
 
 
@@ -267,7 +274,7 @@ def test_a_run_stopped_among_the_frames_and_among_the_second_passes_is_finished(
         return finish_one(finisher, draft)
 
     def track(reporter: Silent, resume: bool = True) -> tuple[Result, ...]:
-        run = task(PAIR, Rendered(MASKS.max(axis=0)), frames=(0, COUNT), people="all")
+        run = task(POSED, Rendered(MASKS.max(axis=0)), frames=(0, COUNT), people="all")
         track_task(run, tmp_path / "r.h5", reporter, resume=resume)
         return read_result(tmp_path / "r.h5").people
 
@@ -286,7 +293,7 @@ def test_a_run_stopped_among_the_frames_and_among_the_second_passes_is_finished(
 
 def test_a_bystander_is_no_part_of_the_subject() -> None:
     notes: list[str] = []
-    found = list(estimates(task(PAIR, Rendered(MASKS.max(axis=0)), frames=(0, 3), people=(0,)), notes.append))
+    found = list(estimates(task(PAIR, Rendered(MASKS.max(axis=0)), frames=(0, 2), people=(0,)), notes.append))
     assert {e.person for e in found} == {0} and "lost" not in {e.status for e in found}
     joints = np.array([e.joints for e in found])
     assert min(far_off(joints, who) for who in (0, 1)) < 0.04
@@ -309,7 +316,7 @@ def test_a_number_that_nobody_gets_is_an_error_or_a_note(tmp_path: Path) -> None
         track_task(task(PAIR, source, people=(2,), frames=(0, 1)), tmp_path / "r.h5", Silent())
     assert not list(tmp_path.iterdir())
     reporter = Silent()
-    track_task(task(PAIR, source, people=(2, 1), causal=True, frames=(0, 3)), tmp_path / "r.h5", reporter)
+    track_task(task(PAIR, source, people=(2, 1), causal=True, frames=(0, 1)), tmp_path / "r.h5", reporter)
     (found,) = read_result(tmp_path / "r.h5").people
     assert min(far_off(found.joints, who) for who in (0, 1)) < 0.04
     assert reporter.notes == [
@@ -318,9 +325,9 @@ def test_a_number_that_nobody_gets_is_an_error_or_a_note(tmp_path: Path) -> None
     ]
 
 
-ENTERING = 18  # frames; person 1 is there in frames 3 to 16
+ENTERING = 13  # frames; person 1 is there in frames 1 to 11
 ENTER = np.array([walk(ENTERING), walk(ENTERING, first=0.4)])
-ENTER[:, :, :2] += [[[0.35, -0.05]], [[-0.35, 0.05]]]
+ENTER[:, :, :2] += [[[0.55, -0.05]], [[-0.55, 0.05]]]  # apart: each frame takes half the time
 
 
 def track_entering(
@@ -328,7 +335,7 @@ def track_entering(
 ) -> tuple[Result, ...]:
     """Return the results of two people of whom one enters and leaves."""
     masks = np.array([draw_silhouettes(BODY, FOUR, own) for own in ENTER])
-    masks[1, :3] = masks[1, 17:] = 0
+    masks[1, :1] = masks[1, 12:] = 0
     setup = replace(PAIR, fps=fps, subjects=PAIR.subjects[:1])
     options = TrackOptions(ONE_POSE, people=people, causal=True, frames=(0, stop))
     track_task(Task(setup, Rendered(masks.max(axis=0)), options), path, Silent(), resume=resume)
@@ -360,8 +367,8 @@ def test_somebody_who_enters_gets_a_number_and_who_leaves_is_absent(everybody: t
     first, second = everybody
     assert not (first.status >= Status.LOST).any()
     (here,) = np.nonzero(second.status != Status.ABSENT)
-    np.testing.assert_array_equal(here, np.arange(here[0], 17))
-    assert 3 < here[0] < 16 and not (second.status == Status.LOST).any()
+    np.testing.assert_array_equal(here, np.arange(here[0], 12))
+    assert 1 < here[0] < 11 and not (second.status == Status.LOST).any()
     for own, result in zip(ENTER, (first, second), strict=True):
         np.testing.assert_array_equal(result.frames, np.arange(ENTERING))
         joints = np.array([BODY.skeleton.joints(pose) for pose in own])
@@ -372,20 +379,20 @@ def test_somebody_who_enters_later_can_be_chosen(second: tuple[Result, tuple[Sub
     found, subjects = second
     np.testing.assert_array_equal(found.frames, np.arange(ENTERING))
     (here,) = np.nonzero(found.status != Status.ABSENT)
-    assert 3 < here[0] < 16 and not (found.status == Status.LOST).any()
+    assert 1 < here[0] < 11 and not (found.status == Status.LOST).any()
     np.testing.assert_array_equal(np.isfinite(found.pose).all(axis=1), found.status != Status.ABSENT)
-    np.testing.assert_array_equal(here, np.arange(here[0], 17))
+    np.testing.assert_array_equal(here, np.arange(here[0], 12))
     joints = np.array([BODY.skeleton.joints(pose) for pose in ENTER[1][here]])
     assert np.median(np.linalg.norm(found.joints[here] - joints, axis=2)) < 0.1  # coarse settings
     assert [subject.body for subject in subjects] == [None, BODY]  # the subject is the one who is chosen
 
 
-@pytest.mark.parametrize(("people", "stops"), [((1,), (12,)), ((1, 0), (3, 12))])
+@pytest.mark.parametrize(("people", "stops"), [((1,), (10,)), ((1, 0), (1, 10))])
 def test_a_run_with_somebody_who_enters_later_is_resumed(
     second: tuple[Result, Any], everybody: tuple[Result, ...], tmp_path: Path, people: Choice, stops: Sequence[int]
 ) -> None:
     """Stopped before, and after the person enters."""
-    path, end = tmp_path / "part.h5", 14
+    path, end = tmp_path / "part.h5", 12
     for stop in stops:
         track_entering(path, people, stop, resume=stop != stops[0])
     whole = second[:1] if len(people) == 1 else everybody  # in the order in which they came
@@ -397,7 +404,7 @@ def test_a_run_with_somebody_who_enters_later_is_resumed(
         # what was said before the stop, and after it
         assert [note for note in one.notes if "entered" in note or "awaited" in note] == [
             "person 1 is not in the working volume in frame 0, and is awaited",
-            "frame 10: person 1 has entered",
+            "frame 8: person 1 has entered",
         ]
 
 
@@ -413,5 +420,5 @@ def test_attempts_to_track_somebody_who_is_refused_are_twice_as_far_apart_each_t
         start(tracker, frames, subject)
 
     monkeypatch.setattr(RegionTracker, "start", refuse_others)
-    found = track_entering(tmp_path / "r.h5", stop=14, fps=2.0)
-    assert len(found) == 1 and attempts == [0, 10, 11, 13]  # from the eighth frame on
+    found = track_entering(tmp_path / "r.h5", stop=12, fps=2.0)
+    assert len(found) == 1 and attempts == [0, 8, 9, 11]  # from the eighth frame on

@@ -107,7 +107,7 @@ def test_tiny_capture_is_tracked_with_each_value(
     monkeypatch.setattr(subprocess, "run", here)
     config = tmp_path / "quick.toml"
     config.write_text(FITTED, encoding="utf-8")
-    options = ["--factors", "0.5", "--frames", "0:3", "--masks", "auto", "--config", str(config), "--limit", "100"]
+    options = ["--factors", "0.5", "--frames", "0:1", "--masks", "auto", "--config", str(config), "--limit", "100"]
     main(["silhouette.init_frames", "--captures", str(tiny), *options])
     lines = capsys.readouterr().out.splitlines()
     plain, changed = (line.split("mean")[1] for line in lines[2:4])

@@ -65,7 +65,7 @@ class OneOfMany:
         return [Sighting(middle, (middle[0], middle[1] - 0.55 * height), 0.9)]
 
     def _masks(self, picture: NDArray[np.uint8]) -> list[NDArray[np.bool_]]:
-        found = [(np.abs(picture.astype(int) - hue).max(axis=2) < 30) for hue in HUES]
+        found = [(cv2.absdiff(picture, np.full_like(picture, hue)) < 30).all(axis=2) for hue in HUES]
         return sorted((m for m in found if np.count_nonzero(m) > 60), key=lambda m: -int(np.count_nonzero(m)))
 
 

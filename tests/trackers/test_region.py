@@ -582,4 +582,7 @@ def test_spread_counts_each_mode_once_and_the_pose_that_was_left() -> None:
         np.testing.assert_allclose(limbs.spread(SKELETON, POSES[0], POSES[0], found), square / 4)
     # if it was chosen nevertheless, the pose before has a probability of 3/4
     np.testing.assert_allclose(limbs.spread(SKELETON, raised, POSES[0], one), 0.75 * square)
+    # beside a mode that is likelier by far, the pose before counts nothing
+    likelier = limbs.Modes(arm, raised[None], np.array([-2000.0]))
+    assert not limbs.spread(SKELETON, raised, POSES[0], [likelier]).any()
     assert not limbs.spread(SKELETON, POSES[0], POSES[0], []).any()

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from tests.conftest import FITTED, FRAMES, QUICK, Silent, Tk, as_if_killed, track
+from tests.conftest import FITTED, FRAMES, QUICK, Silent, Tk, as_if_killed, track, without_first_pose
 from tests.io.conftest import write_picture
 from tests.run.test_session import send
 from tk.commands.track import EXIT_LOST, _expected_error, end
@@ -103,9 +103,9 @@ def test_the_body_is_fitted_again_although_the_recording_begins_in_the_initialis
     assert np.abs(models[0]["parts/shape"] - models[1]["parts/shape"]).max() > 1e-4
 
 
-def test_another_seed_searches_other_poses_and_finds_the_person_too(tiny: Path, tmp_path: Path) -> None:
+def test_another_seed_searches_other_poses_and_finds_the_person_too(tiny: Path, unposed: Path, tmp_path: Path) -> None:
     config = settings_file.from_toml(f"seed = 5\n{QUICK}")
-    track(open_capture(tiny), tmp_path / "r.h5", config, frames=(0, 3), causal=True)
+    track(open_capture(unposed), tmp_path / "r.h5", config, frames=(0, 3), causal=True)
     assert mean_error(read_result(tmp_path / "r.h5"), tiny) < 0.08
 
 
@@ -257,7 +257,8 @@ def test_frames_without_known_joints_are_reported(
 ) -> None:
     pretend(monkeypatch, 2, 3, found=Reason.HIGH)
     reporter = Silent()
-    assert run(tiny, tmp_path / "r.h5", reporter, frames=(0, 6 if causal else 10), causal=causal).lost == 0
+    options = {"frames": (0, 6 if causal else 10), "causal": causal}
+    assert run(tiny, tmp_path / "r.h5", reporter, **options).lost == 0
     result = read_result(tmp_path / "r.h5")
     assert result.sigma is not None
     first = 2 if causal else 0  # the second pass knows that the residual was high before
@@ -273,7 +274,7 @@ def test_frames_without_known_joints_are_reported(
 
 
 def test_a_person_who_was_tracked_back_to_front_is_tracked_again(
-    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny: Path, unposed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     start = RegionTracker.start
 
@@ -283,17 +284,18 @@ def test_a_person_who_was_tracked_back_to_front_is_tracked_again(
         tracker.start_at(tracker.turned_pose(pose))
 
     monkeypatch.setattr(RegionTracker, "start", start_turned)
-    run(tiny, tmp_path / "proposed.h5", causal=True, frames=(0, 2))
+    run(unposed, tmp_path / "proposed.h5", causal=True, frames=(0, 2))
     assert mean_error(read_result(tmp_path / "proposed.h5"), tiny) < 0.08, "the first pass finds the heading by itself"
     monkeypatch.setattr(
         "tk.trackers.region.of_heading", SimpleNamespace(propose=lambda _, __, pose: np.empty((0, len(pose))))
     )
-    errors = []
-    for causal in (True, False):
-        reporter = Silent()
-        run(tiny, tmp_path / f"{causal}.h5", reporter, causal=causal, frames=(0, 3))
-        errors.append(mean_error(read_result(tmp_path / f"{causal}.h5"), tiny))
-        assert any("faces the other way" in note for note in reporter.notes) != causal
+    first, reporters = tmp_path / "first.h5", [Silent(), Silent()]
+    run(unposed, first, reporters[0], causal=True, frames=(0, 3))
+    second = as_if_killed(first, tmp_path / "second.h5")
+    run(unposed, second, reporters[1], frames=(0, 3), resume=True)
+    errors = [mean_error(read_result(path), tiny) for path in (first, second)]
+    said = [any("faces the other way" in note for note in reporter.notes) for reporter in reporters]
+    assert said == [False, True]
     assert errors[0] > 0.2 and errors[1] < 0.08
 
 
@@ -315,7 +317,8 @@ def test_the_body_of_an_earlier_result_is_used_unchanged_and_a_second_pass_ends_
         run(tiny, result, body=refined, frames=(0, 4), resume=True)
     assert result.read_bytes() == before
     # nothing to be done is no mistake, and changes nothing
-    ran = tk("track", tiny, "-o", result, "--config", quick, "--body", refined, "--frames", ":2", "--resume")
+    given = ["--config", quick, "--body", refined]
+    ran = tk("track", tiny, "-o", result, *given, "--frames", ":2", "--resume")
     assert ran.code == 0 and "2 of 2 frames are finished already" in ran.err
     assert result.read_bytes() == before
 
@@ -383,8 +386,7 @@ def test_a_run_with_another_body_is_not_resumed(
 
 @pytest.mark.parametrize("method", ["region", "silhouette"])
 def test_tracking_starts_from_any_pose_in_any_frame(copy: Path, tmp_path: Path, method: str) -> None:
-    file = copy / "capture.toml"
-    file.write_text(file.read_text(encoding="utf-8").replace("da-vinci", "any"), encoding="utf-8")
+    without_first_pose(copy, ("da-vinci", "any"))
     run(copy, tmp_path / "r.h5", frames=(4, 7), causal=True, method=method)
     found = read_result(tmp_path / "r.h5")
     assert found.frames.tolist() == [4, 5, 6] and found.status[0] == Status.INITIALISED
@@ -394,8 +396,7 @@ def test_the_volumetric_tracker_accepts_and_stores_a_body(
     copy: Path, causal: Path, tracked: Path, tmp_path: Path
 ) -> None:
     """One body serves both skins."""
-    file = copy / "capture.toml"
-    file.write_text(file.read_text(encoding="utf-8").replace("da-vinci", "any"), encoding="utf-8")
+    without_first_pose(copy, ("da-vinci", "any"))
     for method, given in (("volumetric", causal), ("region", tracked)):
         path = tmp_path / f"{method}.h5"
         track(open_capture(copy), path, CONFIG, method=method, frames=(6, 9), body=given, causal=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import scipy  # its packages are imported when they are first used
@@ -147,6 +148,10 @@ class PeopleWatch:
             # if cameras contradict each other, everybody may seem to be outside
             self._first = [taken[k] for k, person in enumerate(found) if person.inside or k == 0]
 
+    @cached_property
+    def _grid(self) -> RayGrid:
+        return RayGrid(self._capture.rig, FINE_ROWS)
+
     def of_first(self, index: int, masks: NDArray[np.uint8], landmarks: Float | None) -> NDArray[np.uint8]:
         """Return the masks (C, H, W) of a frame, whose landmarks are (N, C, L, 4), with the pixels of everybody but
         person 0 as those of others."""
@@ -154,9 +159,8 @@ class PeopleWatch:
         last = min(path, key=lambda look: abs(look[0] - index))[1]
         found = self._finder.find(masks, landmarks=landmarks)
         by_distance = sorted(found, key=lambda person: float(np.linalg.norm(person.position - last.position)))
-        grid = RayGrid(rig, FINE_ROWS)
         whole = Frame(index, np.empty((len(rig), 0, 0, 3), np.uint8), masks)
-        return owners_by_hulls(rig, grid, by_distance, whole).share(whole, 0).masks
+        return owners_by_hulls(rig, self._grid, by_distance, whole).share(whole, 0).masks
 
     def people(self) -> tuple[PersonReport, ...]:
         """Return the people. Somebody who was seen only for a moment is left out; the numbers of the people in the look

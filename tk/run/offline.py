@@ -49,10 +49,12 @@ class Finished:
     Attributes:
         revisions: of each person's result, by number.
         cameras: the cameras of the recorded images, refined if they were; None if the tracker has no segments.
+        status: of each person's frames, (F,).
     """
 
     revisions: Mapping[int, Revision]
     cameras: UsedCameras | None
+    status: list[NDArray[np.uint8]]
 
 
 def finish(
@@ -96,7 +98,11 @@ def finish(
             revisions[number] = without_absent(finisher.revision(draft), draft.result.status == Status.ABSENT)
             reasons = draft.current("evidence/reason")
         _report(draft.result.frames, reasons, note, number, finisher.alone)
-    return Finished(revisions, finisher.cameras.recorded() if revisions else None)
+    status = [
+        np.asarray(revisions[person.person].columns["status"]) if person.person in revisions else person.status
+        for person in found
+    ]
+    return Finished(revisions, finisher.cameras.recorded() if revisions else None, status)
 
 
 @dataclass

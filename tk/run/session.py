@@ -16,7 +16,7 @@ from tk.io.captures.capture import Capture
 from tk.io.captures.film import Film
 from tk.io.captures.mask_store import MaskStores
 from tk.io.results.files import check_result_path
-from tk.io.results.reader import read_people, read_result
+from tk.io.results.reader import read_result
 from tk.io.results.revision import revise_people
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
@@ -136,7 +136,7 @@ def track_task(
         masks = stores if second_pass else None  # it needs those of all frames
         loop = Loop(plan, note, Output(writer, done, plan.origin(), said), masks)
         started = time.perf_counter()
-        interrupted = False
+        interrupted, status = False, list[NDArray[np.uint8]]()
         try:
             with writer:
                 reporter.begin(plan.total, min(done, plan.total) if plan.total else done)
@@ -153,6 +153,7 @@ def track_task(
                     finished = finish(found, task, loop.people, masks, note, reporter.within)
                 if said or finished.revisions:
                     revise_people(output, finished.revisions, finished.cameras, said or None)
+                status = finished.status
             stores.remove()
         except KeyboardInterrupt:
             # caught outside the writer, which then keeps an older result if no frame is finished
@@ -160,9 +161,10 @@ def track_task(
         finally:
             if not done + loop.written:
                 stores.remove()
-        tracks = read_people(output) if done + loop.written else ()
-        status = [track.status for track in tracks if track.status is not None] or [np.zeros(0, np.uint8)]
-        return Summary(np.concatenate(status), time.perf_counter() - started, loop.written, interrupted, len(status))
+        if not status and done + loop.written:  # nothing was left to do, or it was interrupted
+            status = [person.status for person in read_result(output).people]
+        whole = np.concatenate(status) if status else np.zeros(0, np.uint8)
+        return Summary(whole, time.perf_counter() - started, loop.written, interrupted, max(len(status), 1))
 
 
 def estimates(task: Task, note: Callable[[str], None] = lambda _: None) -> Iterator[Estimate]:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
+from tk.kernels.mask_values import PERSON
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import AVERAGE_BODY
 from tk.model.body.cone_body import ConeBody, build_cone_body
@@ -135,9 +136,14 @@ def find_in(finder: ContourFinder, seen: Seen, pose: Float | None, alone: bool) 
         alone: no other frame follows, which would correct the limbs.
 
     Raises:
-        CaptureError: fewer than two cameras see anybody.
+        CaptureError: fewer than two cameras see anybody; with a given pose, none does.
     """
     if pose is not None:
+        if not (seen.pyramid.masks[0] >= PERSON).any():
+            raise CaptureError(
+                f"initialisation: no mask of frame {seen.frame.index} shows anybody: check the masks, or give the pose "
+                "of another frame"
+            )
         return Found(0.0, finder.improved(seen, pose)[None])
     skeleton = finder.body.skeleton
     found = np.concatenate([anywhere.propose(finder, seen), landmarks.propose(finder, seen)])

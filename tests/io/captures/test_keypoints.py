@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from scripts.synthetic.keypoints import write_keypoints
-from tests.conftest import QUICK, Tk, refused, track
+from tests.conftest import QUICK, Tk, refused, track, without_first_pose
 from tk.errors import CaptureError
 from tk.io import settings_file
 from tk.io.captures.capture import Capture, open_capture
@@ -77,9 +77,9 @@ def test_triangulation_survives_noise_wrong_points_and_a_bystander(
 def test_tracking_starts_from_keypoints(detected: Path, tiny: Path, tmp_path: Path, tk: Tk, quick: Path) -> None:
     folder = Path(shutil.copytree(tiny, tmp_path / "capture"))
     shutil.copytree(detected, folder / "pose")
-    capture_file = folder / "capture.toml"
-    text = capture_file.read_text().replace('pose = "da-vinci"', 'pose = "any"\nkeypoints = "pose"')
-    capture_file.write_text(text.replace("frame = 0", f"frame = {FRAME}"))
+    without_first_pose(
+        folder, ('pose = "da-vinci"', 'pose = "any"\nkeypoints = "pose"'), ("frame = 0", f"frame = {FRAME}")
+    )
     results = []
     opened = open_capture(folder)
     assert opened.init_keypoints == folder / "pose"

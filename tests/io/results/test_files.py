@@ -19,7 +19,7 @@ import pytest
 
 from tests.io.result_files import append, assert_complete, fail_after, resume, write
 from tests.io.result_victim import META
-from tk.errors import ResultError, TkError
+from tk.errors import ResultBusyError, ResultError, TkError
 from tk.io.results.reader import read_joints, read_result, read_truth
 from tk.io.results.writer import ResultWriter
 
@@ -171,7 +171,7 @@ def test_loop_of_links_is_named(tmp_path: Path) -> None:
 
 def test_two_runs_cannot_write_the_same_file(path: Path) -> None:
     with ResultWriter.create(path, META) as writer:
-        with pytest.raises(ResultError, match=r"result\.h5: another run"):
+        with pytest.raises(ResultBusyError, match=r"result\.h5: another run"):
             ResultWriter.create(path, META)
         append(writer, 0)
     assert assert_complete(path, 1) == 1
@@ -192,7 +192,7 @@ from pathlib import Path
 import numpy as np
 from tests.io.result_files import append, make_smoothed
 from tests.io.result_victim import META
-from tk.errors import ResultError, TkError
+from tk.errors import ResultBusyError, ResultError, TkError
 from tk.io.results.reader import read_result
 from tests.io.result_files import revise_result
 from tk.io.results.writer import ResultWriter

@@ -144,7 +144,8 @@ def spread(skeleton: Skeleton, pose: Float, before: Float, found: Sequence[Modes
         poses = np.repeat(pose[None], len(limb), axis=0)
         poses[:, one.limb.dofs] = limb
         kept = different(skeleton, poses, SAME_POSE_M)
-        weight = np.exp(-np.concatenate([[0.0], one.cost])[kept])
+        cost = np.append(0.0, one.cost)[kept]
+        weight = np.exp(cost.min() - cost)  # of a person who was elsewhere, a mode may be a thousand nats likelier
         away = ((skeleton.joints(poses[kept]) - joints) ** 2).sum(axis=-1) / 3
         variance += weight @ away / weight.sum()
     return variance
