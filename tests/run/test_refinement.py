@@ -66,8 +66,7 @@ def with_turned_camera(tiny: Path, parent: Path, degrees: float) -> Path:
 def run(turned: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Silent]:
     """A result, and what was said."""
     path, reporter = tmp_path_factory.mktemp("results") / "result.h5", Silent()
-    options: dict[str, Any] = {"frames": (0, 11)}
-    assert track(open_capture(turned), path, settings_file.from_toml(QUICK), reporter, **options).lost == 0
+    assert track(open_capture(turned), path, settings_file.from_toml(QUICK), reporter, frames=(0, 11)).lost == 0
     return path, reporter
 
 
@@ -118,8 +117,7 @@ def test_cameras_that_were_moved_are_not_compared(tiny: Path, tmp_path: Path, mo
 
     monkeypatch.setattr(finish, "compare_cameras", compare)
     monkeypatch.setattr(CameraMonitor, "moved", np.array([False, True, False, False]))
-    options: dict[str, Any] = {"frames": (0, 2)}
-    track(open_capture(tiny), tmp_path / "moved.h5", settings_file.from_toml(QUICK), **options)
+    track(open_capture(tiny), tmp_path / "moved.h5", settings_file.from_toml(QUICK), Silent(), frames=(0, 2))
     assert (seen[0] == [True, False, True, True]).all()
 
 
@@ -144,8 +142,7 @@ def test_late_videos_are_tracked_again_unless_the_poses_follow(
     monkeypatch.setattr(finish, "explains_better", lambda *_: better.pop(0))
     monkeypatch.setattr(Capture, "frames", remember)
     path, reporter = tmp_path / "again.h5", Silent()
-    options: dict[str, Any] = {"frames": (2, 12)}
-    assert track(open_capture(tiny), path, settings_file.from_toml(QUICK), reporter, **options).lost == 0
+    assert track(open_capture(tiny), path, settings_file.from_toml(QUICK), reporter, frames=(2, 12)).lost == 0
     assert [late.tolist() for late in asked] == [[0, 0, 0, 0], [0, 0, 1, -1]][: 1 + again]
     assert any("tracking again" in note for note in reporter.notes) == again
     result = read_result(path)
@@ -175,8 +172,7 @@ def test_delays_that_explain_the_images_worse_are_not_used(
 
 def test_excluded_camera_is_used_after_the_refinement(turned_more: Path, tiny: Path, tmp_path: Path) -> None:
     path, reporter = tmp_path / "r.h5", Silent()
-    options: dict[str, Any] = {"frames": (0, 11)}
-    track(open_capture(turned_more), path, settings_file.from_toml(FITTED), reporter, **options)
+    track(open_capture(turned_more), path, settings_file.from_toml(FITTED), reporter, frames=(0, 11))
     assert any("cam2" in note and "left out of frames 0 to 10" in note for note in reporter.notes)
     assert "tracked again: no camera is left out" in reporter.notes
     result, truth = read_result(path), read_joints(tiny / "truth.h5").positions[:11]
