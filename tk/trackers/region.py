@@ -47,15 +47,7 @@ from tk.optim.quadratic import Quadratic
 from tk.settings import RegionSettings, Settings, SilhouetteSettings
 from tk.trackers.contour_finder import INFORMATION, Seen
 from tk.trackers.contour_tracker import ContourTracker
-from tk.trackers.hypotheses import (
-    DROPPED,
-    PROPOSED,
-    RENEWAL,
-    SAME_POSE_M,
-    Hypothesis,
-    disagreement,
-    walking,
-)
+from tk.trackers.hypotheses import DROPPED, PROPOSED, RENEWAL, SAME_POSE_M, Hypothesis, disagreement, walking
 from tk.trackers.judgement import RECOVER_EVERY, Match, depth_known
 from tk.trackers.proposals import exchanged, limbs
 from tk.trackers.proposals import landmarks as of_landmarks
