@@ -18,6 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import tomli_w
+from scipy.optimize import linear_sum_assignment
 
 from scripts.any_start import Quiet
 from scripts.faults import SILENT_M, Outcome
@@ -50,24 +51,26 @@ def people_of(capture: Capture, work: Path) -> Sequence[JointTrack]:
     return read_truth(work / "whole.h5")
 
 
-def outcomes(found: Path, truth: np.ndarray) -> Iterator[Outcome]:
-    """Yield the outcome of each person with true joints (P, J, 3), by the result's nearest person."""
+def outcomes(found: Path, truth: np.ndarray) -> Iterator[Outcome | None]:
+    """Yield the outcome of each person with true joints (P, J, 3); None for somebody whom the result does not have."""
     people = [person for person in read_result(found).people if np.isfinite(person.joints).all()]
-    for expected in truth:
-        errors = [np.linalg.norm(person.joints[0] - expected, axis=-1) for person in people]
-        if not errors:
-            yield Outcome.empty(0, [])
+    joints = np.array([person.joints[0] for person in people]).reshape(-1, 1, *truth.shape[1:])
+    errors = np.linalg.norm(joints - truth, axis=-1)  # (N, P, J)
+    pairs = zip(*linear_sum_assignment(np.nanmean(errors, axis=-1)), strict=True)
+    whose = {int(true): int(person) for person, true in pairs}
+    for k in range(len(truth)):
+        if k not in whose:
+            yield None
             continue
-        best = int(np.argmin([np.nanmean(error) for error in errors]))
-        sigma = people[best].sigma
-        assert sigma is not None
-        yield Outcome(0, [], errors[best][None], people[best].status[:1], sigma[:1])
+        person = people[whose[k]]
+        assert person.sigma is not None
+        yield Outcome(0, [], errors[whose[k], k][None], person.status[:1], person.sigma[:1])
 
 
-def described(outcome: Outcome) -> str:
+def described(outcome: Outcome | None) -> str:
     """Return the cells of a person."""
-    if not len(outcome.status):
-        return "no pose"
+    if outcome is None:
+        return "not found"
     error, sigma = 100 * outcome.error_m[0], 100 * outcome.sigma_m[0]
     far = [f"{JOINTS[j]} {error[j]:.0f} ± {sigma[j]:.0f}" for j in np.flatnonzero(error > 100 * SILENT_M)]
     mark = " suspect" if outcome.suspect.any() else ""
