@@ -421,4 +421,4 @@ def test_attempts_to_track_somebody_who_is_refused_are_twice_as_far_apart_each_t
 
     monkeypatch.setattr(RegionTracker, "start", refuse_others)
     found = track_entering(tmp_path / "r.h5", stop=12, fps=2.0)
-    assert len(found) == 1 and attempts == [0, 8, 9, 11]  # from the eighth frame on
+    assert len(found) == 1 and attempts == [0, 7, 8, 10]  # from the eighth frame on
