@@ -16,7 +16,7 @@ from tk.model.body.cone_body import build_cone_body
 from tk.model.body.gait_poses import neutral_pose, standing_pose, walking_pose
 from tk.model.body.skeleton import JOINTS, shoulder_angles
 from tk.model.cues.ray_costs import Evidence
-from tk.model.setup import Subject
+from tk.model.setup import InitPose, Subject
 from tk.optim.gauss_newton import BatchSolution
 from tk.settings import SilhouetteSettings
 from tk.trackers.hypotheses import DROPPED, TrajectoryHypothesis, walking
@@ -213,6 +213,18 @@ def test_landmarks_show_the_stature_of_somebody_who_sits_with_a_low_hull(stature
     frame = Frame(0, np.zeros(0, np.uint8), masks, landmarks=seen[None])
     tracker = tracker_of()
     assert stature_of(tracker, [tracker.pyramid(frame)], 0.75 * stature) == pytest.approx(stature, rel=0.05)
+
+
+def test_wrong_joints_of_a_given_pose_change_no_stature() -> None:
+    """As a network's keypoints have them: some lie far from the person."""
+    pose = placed(standing_pose(SKELETON), 0.4)
+    masks = draw_silhouettes(BODY, RIG, pose[None])[0]
+    joints = dict(zip(JOINTS, SKELETON.joints(pose), strict=True))
+    for k, name in enumerate(("shoulder_r", "elbow_l", "ankle_l", "knee_r")):
+        joints[name] = joints[name] + np.roll([0.9, -0.4, 0.2], k)
+    tracker = SilhouetteTracker(RIG, "z", SilhouetteSettings(adapt=False))
+    tracker.find([Frame(0, np.zeros(0, np.uint8), masks)], Subject(init=InitPose(joints, {}, 0)))
+    assert tracker.body.dimensions.barefoot == pytest.approx(STATURE, rel=0.09)
 
 
 @pytest.mark.parametrize("height", [1.25, 2.4])

@@ -208,7 +208,7 @@ class ContourFinder:
                 height.
         """
         pyramids, init = [self.pyramid(frame) for frame in frames], subject.init
-        stature, expected = (init and init.height_m) or subject.height_m, None
+        stature = (init and init.height_m) or subject.height_m
         if init is None:
             centroid(self.views.rig, pyramids[0], frames[0].index)  # raises if nobody is there, before a body is taken
             if stature:
@@ -219,7 +219,6 @@ class ContourFinder:
                         f"{apparent:.2f} m: correct the height in capture.toml, or omit it; if it is right, "
                         "calibration.toml has another unit or scale"
                     )
-            expected = BodyDimensions.from_stature(stature or stature_of(self, pyramids, subject.hull_m))
         begun, self._begun = self._begun, None
         if len(frames) == 1 or begun is None or not begun.serves(frames[0], subject):
             begun = self._begin(frames[0], pyramids[0], subject, len(frames) == 1)
@@ -227,8 +226,8 @@ class ContourFinder:
         hypotheses = find_person(self, seen, begun.rough, begun.found)
         if not self.contours.adapt or subject.body is not None:
             return np.asarray(hypotheses[0].poses[0])
-        barefoot = (expected or begun.average).barefoot
-        return self._adapt(frames, pyramids, hypotheses, barefoot, stature is not None)
+        expected = BodyDimensions.from_stature(stature or stature_of(self, pyramids, subject.hull_m))
+        return self._adapt(frames, pyramids, hypotheses, expected.barefoot, stature is not None)
 
     def _begin(self, frame: Frame, pyramid: Pyramid, subject: Subject, alone: bool = False) -> _Begun:
         """Take an average body, or the one that is known, and search for the person in the first frame of an opening.
@@ -241,7 +240,7 @@ class ContourFinder:
             stature = subject.height_m or stature_of(self, [pyramid], subject.hull_m)
             average = BodyDimensions.from_stature(stature)
         else:
-            height_m = init.height_m or subject.height_m
+            height_m = init.height_m or subject.height_m or stature_of(self, [pyramid])
             average, given, angles = rough_pose(init.joints, init.angles, height_m, self.world)
         self.take_body(subject.body or build_cone_body(average))
         if init is not None:

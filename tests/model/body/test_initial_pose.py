@@ -1,7 +1,6 @@
 """Initial poses written by a person."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -36,14 +35,6 @@ def test_joints_of_the_rough_pose_are_near_the_written_ones(seed):
         build_skeleton(dimensions, paper=True).joints(WORLD.poses_out(found)) - skeleton.joints(pose), axis=1
     )
     assert error.max() < 0.04 and error.mean() < 0.02
-
-
-def test_stature_is_estimated_from_the_joints():
-    skeleton = build_skeleton(BodyDimensions.from_stature(1.62))
-    joints = dict(zip(JOINTS, skeleton.joints(neutral_pose(skeleton)), strict=True))
-    limbs = {name: x for name, x in joints.items() if name not in ("head_top", "pelvis")}
-    dimensions, _, _ = rough_pose(limbs, {}, None, WORLD)
-    assert dimensions.thigh == pytest.approx(BodyDimensions.from_stature(1.62).thigh, rel=0.01)
 
 
 def test_written_angles_are_clipped_to_the_limits():

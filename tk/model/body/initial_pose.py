@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.body.anthropometry import FRACTIONS, BodyDimensions
+from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.gait_poses import neutral_pose
 from tk.model.body.joints import HIPS, LIMBS, SHOULDERS
 from tk.model.body.skeleton import JOINTS, Skeleton, build_skeleton, shoulder_angles
 from tk.model.cameras.tracker_frame import TrackerFrame
-from tk.model.setup import AVERAGE_STATURE_M
 from tk.optim.trajectory import Equations, minimise
 
 Float = NDArray[np.float64]
@@ -31,20 +28,20 @@ _ITERATIONS, _LONGEST_STEP = 30, 0.4
 
 
 def rough_pose(
-    joints: dict[str, Float], angles: dict[str, float], height_m: float | None, world: TrackerFrame
+    joints: dict[str, Float], angles: dict[str, float], height_m: float, world: TrackerFrame
 ) -> tuple[BodyDimensions, Skeleton, Float]:
     """Return the average body, and its pose in the tracker's frame, from numbers in the capture's world.
 
     Args:
         joints: name → (3,) metres of some joints; or empty.
         angles: name → value of some entries of the pose vector (radians, metres); or empty.
-        height_m: the subject's height; None: estimated from the joints' distances, or 1.72 m.
+        height_m: the subject's height.
         world: the tracker's frame.
 
     Returns:
         Dimensions, a skeleton of these, and its pose (D,).
     """
-    dimensions = BodyDimensions.from_stature(height_m or _stature_of(joints) or AVERAGE_STATURE_M)
+    dimensions = BodyDimensions.from_stature(height_m)
     if angles:
         skeleton = build_skeleton(dimensions)
         pose = neutral_pose(skeleton)
@@ -100,18 +97,3 @@ def figures(skeleton: Skeleton, p_pelvis: Float) -> Float:
     poses[:, skeleton.index("torso_yaw")] = np.tile(np.arange(HEADINGS) * 2 * np.pi / HEADINGS, 2)
     poses[:, :3] = p_pelvis
     return poses
-
-
-def _stature_of(joints: dict[str, Float]) -> float | None:
-    """Return the median stature by the distances of neighbouring joints; None if there are fewer than three."""
-    table = {
-        ("pelvis", "neck"): FRACTIONS["trunk"],
-        ("neck", "head_top"): FRACTIONS["head"],
-        SHOULDERS: 2 * FRACTIONS["shoulder_half_width"],
-    }
-    for limb, names in LIMBS.items():
-        dimensions = ("upper_arm", "forearm") if limb.startswith("arm") else ("thigh", "calf")
-        table |= {bone: FRACTIONS[name] for bone, name in zip(pairwise(names), dimensions, strict=True)}
-    known = [(a, b, ratio) for (a, b), ratio in table.items() if a in joints and b in joints]
-    found = [np.linalg.norm(joints[a] - joints[b]) / ratio for a, b, ratio in known]
-    return float(np.clip(np.median(found), LEAST_STATURE, GREATEST_STATURE)) if len(found) >= 3 else None
