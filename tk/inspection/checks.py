@@ -92,10 +92,8 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
             # the others are people, not what a turned camera shows of one person
             masks, agreement = own, alone
     bad = np.array([[i in images for images in read.bad_images] for i in frames.tolist()], np.bool_)
-    by_masks, agreement = (
-        agreement,
-        confirmed(agreement, capture.rig, [read.landmarks[i] for i in frames.tolist()], bad),
-    )
+    by_masks, marked = agreement, [read.landmarks[i] for i in frames.tolist()]
+    agreement = confirmed(by_masks, capture.rig, marked, bad)
     late, sure = find_delays(compare, masks, centers, agreement)
     for c in () if sure else np.flatnonzero(late).tolist():
         notes.append(
