@@ -129,8 +129,10 @@ class Person(Stateful[PersonMotion]):
         tracker = sharing(self.tracker)
         if tracker is None or self.lost:
             return False
-        if self.drawn is None or self.place is None:
+        if self.place is None:
             return True
+        if self.drawn is None:  # the tracker renders no body
+            return False
         shown = tracker.coarse_grid.sample(masks) >= PERSON
         for camera, cells, body in zip(rig, shown, self.drawn, strict=True):
             area = np.count_nonzero(body)
