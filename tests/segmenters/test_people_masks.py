@@ -269,12 +269,34 @@ class Standing(OneOfMany):
         return found, landmarks
 
 
+class Embracing(Standing):
+    """Takes people who touch for one region; sees the landmarks of the one in the middle of the square."""
+
+    def segment_pose(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        masks, landmarks = self._masks(image), np.full((12, 3), np.nan)
+        middle = (len(image) - 1) / 2
+        if masks:
+            y, x = min((np.nonzero(mask) for mask in masks), key=lambda pixels: abs(float(pixels[1].mean()) - middle))
+            for row, share in ((0, 0.0), (6, 0.5), (10, 1.0)):
+                landmarks[row : row + 2] = x.mean(), y.min() + share * np.ptp(y), 0.9
+        return np.asarray(0.9 * np.any([*masks, np.zeros(image.shape[:2])], axis=0), np.float32), landmarks
+
+
+def test_two_who_touch_are_found_where_each_image_shows_the_nearer_one() -> None:
+    """Between them is a point that all four lines of sight pass; the masks show both."""
+    places = [(-0.14, 0.24), (0.14, -0.24)]
+    found = masks_of(Embracing()).label(shown(places)[0])
+    assert len(found.landmarks) == 2
+    hips = [triangulate_joints(RIG, person)[0][LANDMARKS.index("hip_l")] for person in found.landmarks]
+    np.testing.assert_allclose(sorted(hip[:2].tolist() for hip in hips), places, atol=0.1)
+
+
 @pytest.mark.parametrize(
     ("now", "searched", "asked"),
     [
         ([(0.25, 0.1)], 2, 4),  # every second image is searched for others
         ([(0.6, 0.1)], 2, 8),  # some squares about the last place do not hold the person
-        ([(0.25, 0.1), (-0.6, -0.2)], 8, 20),
+        ([(0.25, 0.1), (-0.6, -0.2)], 8, 25),
         ([], 4, 4),
     ],
     ids=["there", "moved on", "a newcomer", "gone"],

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.model.body.plausibility import EXTENT, STATURE_M
+from tk.model.cameras.landmark_agreement import APART_M
 from tk.model.cameras.volume import VoxelGrid
 from tk.model.hull.coarse import LEAST_LITRES
 from tk.model.hull.voxel_table import components
@@ -24,8 +25,6 @@ _MOST_LITRES, _SPECK_LITRES = 250.0, 4.0
 # A column of the floor plan is part of a trunk if so many metres of it are in the hull: an arm has 0.1 m, the trunk of
 # a crouching adult 0.6 m.
 _TRUNK_M = 0.5
-# Trunks of two people are at least so far apart, metres: the depth of a chest (0.25 m) and an error of a voxel.
-APART_M = 0.3
 # Standard deviation of the smoothed floor plan, metres: half of a trunk's depth.
 _SMOOTH_M = 0.1
 # Radius of a person's column in a block, metres: half the breadth of the shoulders, and a step.

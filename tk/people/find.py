@@ -21,17 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.mask_values import PERSON
-from tk.model.body.body_points import LANDMARKS
-from tk.model.body.joints import HIPS, SHOULDERS
 from tk.model.body.plausibility import STATURE_M
 from tk.model.body.skeleton import up_rotation
 from tk.model.cameras.camera import Rig
-from tk.model.cameras.landmark_agreement import consensus
+from tk.model.cameras.landmark_agreement import APART_M, consensus, trunk
 from tk.model.cameras.volume import Volume, VoxelGrid
 from tk.model.hull.coarse import Voxels, dilated
 from tk.model.hull.voxel_table import VoxelTable
 from tk.model.masks.sightings import BEYOND_M
-from tk.people.columns import APART_M, MOST, HullColumns, Near
+from tk.people.columns import MOST, HullColumns, Near
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -61,7 +59,6 @@ _HEIGHT_STEP_M = 0.1
 # Half the width and half the height of the space in which one person is followed, metres; and how far this person may
 # move between frames.
 _HALF_M, _HALF_HEIGHT_M, _STEP_M = 0.9, 1.1, 0.4
-_TRUNK = [LANDMARKS.index(name) for name in (*SHOULDERS, *HIPS)]
 
 
 @dataclass(frozen=True)
@@ -298,11 +295,9 @@ class PeopleFinder:
         volume: how large their hulls are is unknown."""
         places: list[tuple[Float, float]] = []
         for seen in () if landmarks is None else landmarks:
-            trunk = consensus(self.rig, seen).points[_TRUNK]
-            if np.isfinite(trunk).all():
-                place = trunk.mean(axis=0)
-                if all(np.linalg.norm(place - other) >= APART_M for other, _ in places):
-                    places.append((place, 0.0))
+            place = trunk(consensus(self.rig, seen).points)
+            if np.isfinite(place).all() and all(np.linalg.norm(place - p) >= APART_M for p, _ in places):
+                places.append((place, 0.0))
         return places
 
     def _candidates(self, seen: tuple[Bool, Bool, Bool], cameras: Sequence[int], near: Near) -> list[LocatedPerson]:

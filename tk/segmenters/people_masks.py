@@ -3,15 +3,17 @@
 A network segments the person in the middle of a square. It is inaccurate for a small person in a large image, prefers
 one person if a square shows several, and misses people whom others hide. The calibrated cameras solve this:
 
-1. The segmenter detects people in every image. Detections are matched across the cameras, which gives the people in
-   space (:mod:`tk.model.masks.sightings`). In every camera, also without a detection (from above, for example), the
-   segmenter gets the square around each person.
+1. The segmenter detects people in every image, and gets the square around each. Detections whose landmarks agree are
+   one person (:func:`~tk.model.cameras.landmark_agreement.grouped`); without landmarks, or where they do not agree,
+   detections are matched by the middle of the body (:mod:`tk.model.masks.sightings`). In every other camera, also
+   without a detection (from above, for example), the segmenter gets the square around each person in space.
 2. Where a person's landmarks in a camera show somebody else than in most cameras, the segmenter gets the square around
    the points that these cameras show. One wrong mask spoils a hull, so hulls serve only where no landmarks agree: if
    the square does not contain the hull of the person's other masks or is much too large, or the mask shows another,
    the segmenter gets the square around the hull. A further answer counts only if the cameras agree no less on the
    person's landmarks.
-3. The people who are found are painted over, and the search is repeated until nobody new is found. Detections that
+3. The people who are found are painted over, and the search is repeated until nobody new is found: a detection whose
+   landmarks show one of them is no newcomer, nor is a person whose trunk is where one of theirs is. Detections that
    match no other camera's are people whom one camera shows.
 4. Where somebody else stands in a person's square, the segmenter gets the square again, with everybody else painted
    over.
@@ -27,7 +29,7 @@ No state is kept between frames, so a resumed run sees the same masks.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
@@ -38,10 +40,18 @@ from numpy.typing import NDArray
 
 from tk.model.body.body_points import LANDMARKS
 from tk.model.cameras.camera import Rig
-from tk.model.cameras.landmark_agreement import Consensus, associated, consensus
+from tk.model.cameras.landmark_agreement import (
+    APART_M,
+    Consensus,
+    associated,
+    consensus,
+    evidence_of_sets,
+    grouped,
+    trunk,
+)
 from tk.model.cameras.volume import Volume
 from tk.model.hull.coarse import CoarseHull, parts
-from tk.model.masks.sightings import Patch, SeenPerson, Sighting, locate, volume_patch
+from tk.model.masks.sightings import Patch, SeenPerson, Sighting, locate, near, place_of, volume_patch
 from tk.segmenters import Finder, Segmenter, segmented
 from tk.system.machine import cores
 
@@ -87,6 +97,16 @@ class _Person:
     uncertain: Bool
     landmarks: NDArray[np.float64]
     agreement: Consensus | None = None
+
+
+class _View(NamedTuple):
+    """What the segmenter sees of a sighting in an image."""
+
+    sighting: Sighting
+    camera: int
+    patch: Patch
+    found: NDArray[np.float32]  # (H, W) probabilities
+    landmarks: NDArray[np.float64]  # (L, 4)
 
 
 class Segmented(NamedTuple):
@@ -188,40 +208,102 @@ class PeopleMasks:
                 people.append(person)
                 self._paint_over(left, person)
         all_there = bool(expected) and len(people) == len(expected)
-        sightings: list[list[Sighting]] = [[] for _ in self._rig]
-        cameras = list(every)[turn % 2 :: 2] if all_there else list(every)
+        cameras, views = list(every)[turn % 2 :: 2] if all_there else list(every), list[_View]()
         for _ in range(_ROUNDS):
-            self._find(left, cameras, sightings)
-            if any(sightings) and len(cameras) < len(images):
-                self._find(left, sorted(set(every) - set(cameras)), sightings)
+            views += self._find(images, left, cameras)
+            if views and len(cameras) < len(images):
+                views += self._find(images, left, sorted(set(every) - set(cameras)))
             cameras = list(every)
-            located, sightings = locate(self._rig, self._volume, sightings)
-            new = [person for seen in located if (person := self._look(left, seen, people))]
+            new, views = self._newcomers(left, people, views)
             if not new:
                 break
             people += new
             for person in new:
                 self._paint_over(left, person)
         self._separate(images, people)
-        return people + self._alone(images, people, sightings)
+        return people + self._alone(images, people, views)
 
-    def _alone(
-        self, images: Images, people: Sequence[_Person], sightings: Sequence[Sequence[Sighting]]
-    ) -> list[_Person]:
-        """Return those whom one camera shows: at sightings that match no other camera's."""
+    def _newcomers(
+        self, left: Images, people: Sequence[_Person], views: list[_View]
+    ) -> tuple[list[_Person], list[_View]]:
+        """Return the people whom views show and who are not among the people already found; and the views that show
+        nobody."""
+        for known in people:
+            views = self._of_others(known, views)
+        new: list[_Person] = []
+        unknown: list[_View] = []
+        while groups := grouped(self._rig, [v.camera for v in views], np.array([v.landmarks for v in views])):
+            members = [views[k] for k in groups[0]]
+            views = [view for k, view in enumerate(views) if k not in groups[0]]
+            joined = self._joined(left, members)
+            if joined is None:
+                unknown += members
+            elif not any(self._in_one_place(joined, other) for other in [*people, *new]):
+                new.append(joined)
+                views = self._of_others(joined, views)
+        views += unknown
+        # each sighting once, in the order of the cameras
+        sightings = [list(dict.fromkeys(v.sighting for v in views if v.camera == c)) for c in range(len(left))]
+        located, rest = locate(self._rig, self._volume, sightings)
+        new += [person for seen in located if (person := self._look(left, seen, [*people, *new]))]
+        return new, [view for view in views if view.sighting in rest[view.camera]]
+
+    def _of_others(self, person: _Person, views: list[_View]) -> list[_View]:
+        """Return the views that do not show a person."""
+        if not views:
+            return views
+        sets = np.array([view.landmarks for view in views])
+        evidence = evidence_of_sets(self._rig, [view.camera for view in views], sets, person.landmarks)
+        return [view for view, ratio in zip(views, evidence, strict=True) if not ratio > 0]
+
+    def _joined(self, left: Images, views: Sequence[_View]) -> _Person | None:
+        """Return the masks of a person whom views of some cameras show; None if nobody in the volume is known to be
+        there.
+
+        All cameras are asked with the squares around the place of the person: they are more exact than the views'.
+        """
+        person = self._empty(self._whole)
+        for view in views:
+            person.patches[view.camera], person.landmarks[view.camera] = view.patch, view.landmarks
+            self._put(person, view.camera, view.found)
+        place = place_of(self._rig, [(view.camera, view.sighting) for view in views])
+        if place is None or not near(trunk(self._agreement(person).points), self._volume):
+            return None
+        self._ask_again(left, person, dict(enumerate(self._patches(place))))
+        self._compare(left, person, range(len(left)))
+        return self._carved(person)
+
+    def _in_one_place(self, *people: _Person) -> bool:
+        """Return whether landmarks show the trunks of two people in one place: they are one person."""
+        a, b = (trunk(self._agreement(person).points) for person in people)
+        return bool(np.linalg.norm(a - b) < APART_M)
+
+    def _alone(self, images: Images, people: Sequence[_Person], views: Sequence[_View]) -> list[_Person]:
+        """Return those whom one camera shows: the views that match no other camera's."""
         alone: list[_Person] = []
-        for c, each in enumerate(sightings):
-            for sighting in each:
-                person = self._empty([sighting.patch(_BALL_MARGIN)] * len(images))
-                self._segment(images, c, person)
-                if self._new_views(person, [*people, *alone])[c]:
-                    alone.append(person)
+        for view in views:
+            person = self._empty([view.patch] * len(images))
+            person.landmarks[view.camera] = view.landmarks
+            self._put(person, view.camera, view.found)
+            if self._new_views(person, [*people, *alone])[view.camera]:
+                alone.append(person)
         return alone
 
-    def _find(self, left: Images, cameras: Sequence[int], sightings: list[list[Sighting]]) -> None:
-        """Add the people in the images of some cameras to the sightings of all cameras."""
-        for c, found in zip(cameras, self._each(lambda c: self._sightings(left, c), cameras), strict=True):
-            sightings[c] += found
+    def _find(self, images: Images, left: Images, cameras: Sequence[int]) -> list[_View]:
+        """Return the people whom the segmenter finds in some images, in which those already found are painted over
+        (``left``). Where a square shows some of these, there are two views: with and without them."""
+
+        def views(c: int) -> list[_View]:
+            found = []
+            for sighting in self._sightings(left, c):
+                patch = sighting.patch(_BALL_MARGIN)
+                same = np.array_equal(patch.cut(left[c]), patch.cut(images[c]))
+                found += [
+                    _View(sighting, c, patch, *self._seen(image, c, patch)) for image in (left[c], images[c])[same:]
+                ]
+            return found
+
+        return [view for each in self._each(views, cameras) for view in each]
 
     def _sightings(self, images: Images, c: int) -> list[Sighting]:
         """Return the people in the part of an image that shows the volume."""
@@ -242,9 +324,9 @@ class PeopleMasks:
         here = SeenPerson.at(self._agreement(person).points)
         if here is None:
             return None
-        for c, better in zip(cameras, self._patches(here), strict=True):
-            if not person.patches[c].fits(better, _BALL_MARGIN, _TOO_LARGE):
-                self._ask_again(left, c, person, better)
+        better = dict(enumerate(self._patches(here)))
+        bad = [c for c in cameras if not person.patches[c].fits(better[c], _BALL_MARGIN, _TOO_LARGE)]
+        self._ask_again(left, person, {c: better[c] for c in bad})
         self._compare(left, person, cameras)
         if SeenPerson.at(self._agreement(person).points) is None:
             return None
@@ -279,7 +361,7 @@ class PeopleMasks:
         for c in cameras:
             better = self._better(person, c)
             if better is not None and better != person.patches[c]:
-                self._ask_again(images, c, person, better)
+                self._ask_again(images, person, {c: better})
 
     def _better(self, person: _Person, c: int) -> Patch | None:
         """Return the square of a person in an image that follows from what the cameras show: where the landmarks of two
@@ -348,12 +430,13 @@ class PeopleMasks:
         landmarks = np.full((len(self._rig), len(LANDMARKS), 4), np.nan)
         return _Person(list(patches), np.zeros(shape, np.uint8), np.zeros(shape, np.bool_), landmarks)
 
-    def _ask_again(self, images: Images, c: int, person: _Person, patch: Patch) -> None:
-        """Give the segmenter another square of a person in an image."""
-        found, landmarks = self._seen(images[c], c, patch)
-        if self._take(person, c, landmarks):
-            person.patches[c] = patch
-            self._put(person, c, found)
+    def _ask_again(self, images: Images, person: _Person, patches: Mapping[int, Patch]) -> None:
+        """Give the segmenter other squares of a person in some images."""
+        answers = self._each(lambda c: self._seen(images[c], c, patches[c]), list(patches))
+        for (c, patch), (found, landmarks) in zip(patches.items(), answers, strict=True):
+            if self._take(person, c, landmarks):
+                person.patches[c] = patch
+                self._put(person, c, found)
 
     def _take(self, person: _Person, c: int, landmarks: NDArray[np.float64]) -> bool:
         """Replace a person's landmarks in an image, unless the cameras then agree less, or there are none any more: the

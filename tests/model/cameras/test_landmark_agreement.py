@@ -12,7 +12,13 @@ from tests.model.landmarks import body_points, landmarks_of
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, walk
 from tk.model.cameras.camera import Rig
-from tk.model.cameras.landmark_agreement import associated, consensus, evidence_for_cameras
+from tk.model.cameras.landmark_agreement import (
+    associated,
+    consensus,
+    evidence_for_cameras,
+    evidence_of_sets,
+    grouped,
+)
 from tk.model.cues.landmarks import log_ratio
 
 RIG = ring_of_cameras(4, 160, 200)
@@ -137,6 +143,26 @@ def test_no_camera_agrees_without_a_pair_that_shows_one_person() -> None:
     alone[1] = landmarks_of(RIG, BODY, POSES[0], 0.02)[1]
     agree, points, _ = consensus(RIG, alone)
     assert not agree.any() and np.isnan(points).all()
+
+
+def test_sightings_of_two_people_who_stand_close_are_grouped_by_person() -> None:
+    """One camera sees both, another neither; the order is any."""
+    people = two_people()
+    sets = [(0, 1), (1, 2), (0, 0), (1, 1), (0, 2), (1, 0)]  # person, camera
+    groups = grouped(RIG, [c for _, c in sets], np.array([people[k, c] for k, c in sets]))
+    assert sorted([sets[i] for i in group] for group in groups) == [[(0, 1), (0, 0), (0, 2)], [(1, 2), (1, 1), (1, 0)]]
+    evidence = evidence_of_sets(RIG, [c for _, c in sets], np.array([people[k, c] for k, c in sets]), people[0])
+    assert ((evidence > 0) == [k == 0 for k, _ in sets]).all()
+
+
+def test_no_two_sightings_of_a_camera_are_one_person_and_no_sighting_is_one_alone() -> None:
+    person = two_people()[0]
+    groups = grouped(RIG, [0, 0, 1], person[[0, 0, 1]])
+    assert [group.tolist() for group in groups] in ([[0, 2]], [[1, 2]])
+    assert grouped(RIG, [0, 0], person[[0, 0]]) == [] == grouped(RIG, [], np.zeros((0, 21, 4)))
+    unknown = np.full((2, 21, 4), np.nan)
+    assert grouped(RIG, [0, 1], unknown) == []
+    assert np.isnan(evidence_of_sets(RIG, [0, 1], person[:2], np.full((4, 21, 4), np.nan))).all()
 
 
 # --- what other images leave open ---------------------------------------------------------------------------------

@@ -15,13 +15,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.model.body.body_points import LANDMARKS
+from tk.model.body.joints import HIPS, SHOULDERS
 from tk.model.cameras.camera import Rig
 from tk.model.cues.landmarks import deviation, known_landmarks, log_ratio, right_share
 
 Float = NDArray[np.float64]
 
+#: trunks of two people are at least so far apart, metres: the depth of a chest (0.25 m) and an error of a voxel
+APART_M = 0.3
 #: how far a point may be from where the landmarks leave it open, metres: a person's size
 REACH_M = 1.0
+
+_TRUNK = [LANDMARKS.index(name) for name in (*SHOULDERS, *HIPS)]
 
 
 def evidence_for_cameras(rig: Rig, landmarks: Sequence[Float]) -> Float:
@@ -85,6 +91,50 @@ def consensus(rig: Rig, seen: Float) -> Consensus:
     who stand close together are separated. Without a pair that agrees, no camera is returned.
     """
     return _Pairs.of(_Sets.of(rig, seen)).consensus()
+
+
+def trunk(points: Float) -> Float:
+    """Return (3,) the middle of shoulders and hips of landmarks' points (L, 3), metres; NaN if one is unknown."""
+    return np.asarray(points[_TRUNK].mean(axis=0))
+
+
+def grouped(rig: Rig, cameras: Sequence[int], seen: Float) -> list[NDArray[np.int64]]:
+    """Return the sets of landmarks that show one person, for each person whom two cameras or more show: indices, one
+    for each camera, the best supported person first.
+
+    Each pair of sets of two cameras proposes a person; the best set of each other camera that shows this person
+    supports it. The most likely person takes these sets; the next one is found among the others. People who touch are
+    told apart by their limbs, although the middles of their bodies are close in the images.
+
+    Args:
+        rig: the cameras.
+        cameras: (S,) camera of each set.
+        seen: (S, L, 4) sets of landmarks; NaN if unknown.
+    """
+    view = np.asarray(cameras, np.int64)
+    found = _Pairs.of(_Sets.of(Rig(tuple(rig[c] for c in view)), seen)) if len(view) else None
+    if found is None:
+        return []
+    apart = view[found.pairs[:, 0]] != view[found.pairs[:, 1]]
+    pairs, fit = found.pairs[apart], np.nan_to_num(found.fit[apart])
+    # the two cameras of a pair support the person by the pair's own sets
+    of_pair = (np.arange(len(view)) == pairs[..., None]).any(axis=1)
+    fit[(view == view[pairs][..., None]).any(axis=1) & ~of_pair] = 0.0
+    same = view[:, None] == view
+    people: list[NDArray[np.int64]] = []
+    while True:
+        best = (fit > 0) & (fit >= np.where(same, fit[:, None, :], 0.0).max(axis=2))  # of its camera
+        support = np.where(best, fit, 0.0).sum(axis=1) * (best | ~of_pair).all(axis=1)
+        if not support.any():
+            return people
+        people.append(np.flatnonzero(best[support.argmax()]))
+        fit[:, people[-1]] = 0.0
+
+
+def evidence_of_sets(rig: Rig, cameras: Sequence[int], seen: Float, person: Float) -> Float:
+    """Return (S,) the logarithm of the likelihood ratio, nats, of sets of landmarks (S, L, 4) in S cameras showing the
+    person whose landmarks (C, L, 4) the C cameras of the rig show; NaN if no two of these agree, or a set is empty."""
+    return _Pairs.of(_Sets.of(rig, person)).fit_without(-1, _Sets.of(Rig(tuple(rig[c] for c in cameras)), seen))
 
 
 class _Sets(NamedTuple):

@@ -165,9 +165,8 @@ def locate(
     seen = [(c, sighting) for c, each in enumerate(sightings) for sighting in each]
     camera = np.array([c for c, _ in seen], np.int64)
     hips = [(rig[c].center, rig[c].rays([s.center])[0]) for c, s in seen]
-    tops = [(rig[c].center, rig[c].rays([s.top])[0]) for c, s in seen]
     pairs = [(a, b) for a, b in combinations(range(len(seen)), 2) if camera[a] != camera[b]]
-    met = [point for a, b in pairs if (point := _meeting([hips[a], hips[b]])) is not None and _near(point, volume)]
+    met = [point for a, b in pairs if (point := _meeting([hips[a], hips[b]])) is not None and near(point, volume)]
     distance = _distances(rig, np.array(met).reshape(-1, 3), seen)
     score = np.array([s.score for _, s in seen])
     people = []
@@ -186,12 +185,25 @@ def locate(
             break
         of_person = np.flatnonzero(chosen[support.argmax()])
         free[of_person] = False
-        center, top = (_meeting([lines[k] for k in of_person]) for lines in (hips, tops))
-        if center is not None and top is not None:
-            radius_m = _radius_m(rig, center, [seen[k] for k in of_person])
-            people.append(SeenPerson(center, top, radius_m, tuple(camera[of_person].tolist())))
+        if (person := place_of(rig, [seen[k] for k in of_person])) is not None:
+            people.append(person)
     rest = [[s for k, (view, s) in enumerate(seen) if view == c and free[k]] for c in range(len(rig))]
     return people, rest
+
+
+def place_of(rig: Rig, seen: Sequence[tuple[int, Sighting]]) -> SeenPerson | None:
+    """Return where a person is by sightings, each with its camera; None if their lines of sight are parallel."""
+    points = np.array([[sighting.center, sighting.top] for _, sighting in seen])
+    origins, rays = (
+        np.array([rig[c].center for c, _ in seen]),
+        np.array([rig[c].rays(p) for (c, _), p in zip(seen, points, strict=True)]),
+    )
+    center, top = (closest_to_lines(origins, rays[:, k]) for k in range(2))
+    if center is None or top is None:
+        return None
+    # the median radius over the cameras
+    radius_m = np.median([s.radius * rig[c].project(center)[1][0] / _focal(rig[c]) for c, s in seen])
+    return SeenPerson(center, top, float(radius_m), tuple(c for c, _ in seen))
 
 
 def _distances(rig: Rig, points: Float, seen: Sequence[tuple[int, Sighting]]) -> Float:
@@ -206,13 +218,9 @@ def _meeting(lines: Sequence[tuple[Float, Float]]) -> Float | None:
     return closest_to_lines(np.array([origin for origin, _ in lines]), np.array([along for _, along in lines]))
 
 
-def _near(point: Float, volume: Volume) -> bool:
+def near(point: Float, volume: Volume) -> bool:
+    """Return whether a point (3,) is in the volume or at most :data:`BEYOND_M` outside; not if it is NaN."""
     return bool(((volume.lower - BEYOND_M <= point) & (point <= volume.upper + BEYOND_M)).all())
-
-
-def _radius_m(rig: Rig, point: Float, seen: Sequence[tuple[int, Sighting]]) -> float:
-    """Return the median radius over the cameras, metres."""
-    return float(np.median([s.radius * rig[c].project(point)[1][0] / _focal(rig[c]) for c, s in seen]))
 
 
 def _focal(camera: Camera) -> float:
