@@ -31,6 +31,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
@@ -260,16 +261,23 @@ class PeopleMasks:
         """Return the masks of a person whom views of some cameras show; None if nobody in the volume is known to be
         there.
 
-        All cameras are asked with the squares around the place of the person: they are more exact than the views'.
+        The squares around the place of the person are more exact than the views', but may show somebody beside: those
+        on which the cameras' landmarks agree better are kept.
         """
-        person = self._empty(self._whole)
-        for view in views:
-            person.patches[view.camera], person.landmarks[view.camera] = view.patch, view.landmarks
-            self._put(person, view.camera, view.found)
         place = place_of(self._rig, [(view.camera, view.sighting) for view in views])
-        if place is None or not near(trunk(self._agreement(person).points), self._volume):
+        if place is None:
             return None
-        self._ask_again(left, person, dict(enumerate(self._patches(place))))
+        person = self._empty(self._patches(place))
+        self._each(lambda c: self._segment(left, c, person), range(len(left)))
+        seen = deepcopy(person)
+        seen.agreement = None
+        for view in views:
+            seen.patches[view.camera], seen.landmarks[view.camera] = view.patch, view.landmarks
+            self._put(seen, view.camera, view.found)
+        if self._agreement(seen).support > self._agreement(person).support:
+            person = seen
+        if not near(trunk(self._agreement(person).points), self._volume):
+            return None
         self._compare(left, person, range(len(left)))
         return self._carved(person)
 
