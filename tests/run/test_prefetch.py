@@ -27,6 +27,7 @@ from tests.run.test_session import assert_same, send
 from tk.errors import ConfigError, VideoError, WorkerError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
+from tk.io.captures.film import Film
 from tk.io.results.reader import read_result
 from tk.run import worker
 from tk.run.prefetch import Ahead, Observations, Serial, open_observations
@@ -73,6 +74,25 @@ def test_prefetched_frames_equal_direct_ones(
         if a[3] is not None and b[3] is not None:
             assert a[3].any()
             np.testing.assert_array_equal(a[3], b[3], strict=True)
+
+
+@pytest.mark.usefixtures("system")
+def test_small_images_are_taken_again_with_the_delays_that_a_run_has_found(tiny: Path, tmp_path: Path) -> None:
+    capture = open_capture(tiny)
+    film = Film.in_folder(tmp_path, [(camera.width, camera.height) for camera in capture.rig], capture.late_frames)
+    assert film is not None
+    film.frames = range(1, FRAMES, 2)
+    delays = [0.0, 0.0, 1 / capture.fps, 0.0]
+    with Ahead(Task.of(capture, AHEAD), nobody, film=film) as observations:
+        for _ in observations.frames(1, FRAMES):
+            pass
+        observations.film_again(delays)
+    assert film.late_frames == (0, 0, 1, 0) and not list(tmp_path.iterdir())
+    shown = dict(film.images(film.frames))
+    with capture.some_frames(film.frames) as as_recorded, capture.shifted(delays).some_frames(film.frames) as shifted:
+        for before, frame in zip(as_recorded, shifted, strict=True):
+            np.testing.assert_array_equal(shown[frame.index], frame.images)
+            assert not np.array_equal(before.images[2], frame.images[2])
 
 
 def test_frames_are_made_here_if_no_memory_can_be_shared(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:

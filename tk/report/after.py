@@ -23,7 +23,7 @@ _WIDEST = 960
 
 def film_for(capture: Capture, result_path: Path) -> Film | None:
     """Return a film for the images that :func:`write_video_and_report` shows; None if it finds no place."""
-    return Film.in_folder(result_path.absolute().parent, sizes_shown(capture, _WIDEST))
+    return Film.in_folder(result_path.absolute().parent, sizes_shown(capture, _WIDEST), capture.late_frames)
 
 
 def write_video_and_report(
@@ -71,7 +71,7 @@ def _pictures(
     overlay: Overlay, capture: Capture, film: Film | None
 ) -> tuple[range, Iterator[tuple[int, Sequence[Image]]]]:
     """Return the frames of the video, also such that the result has not, and those that it has with their images."""
-    if film is not None and overlay.capture.late_frames == capture.late_frames:  # the run has found no other delays
+    if film is not None and film.late_frames == overlay.capture.late_frames:
         shown, kept = [frame for frame in film.frames if frame in overlay.row_of], film.places()
         if shown and kept.keys() >= set(shown):
             return film.frames, film.images(shown)

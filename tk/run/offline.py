@@ -64,6 +64,7 @@ def finish(
     masks: MaskStores | None,
     note: Note,
     within: Callable[[float], None],
+    film_again: Callable[[Sequence[float] | None], None] = lambda _: None,
 ) -> Finished:
     """Return what needs all frames, see :class:`_Finisher`, after people who were mixed up are exchanged.
 
@@ -73,6 +74,7 @@ def finish(
         masks: for the second pass; None: no second pass.
         note: receives lines for the user.
         within: receives the share of a long stage that is done.
+        film_again: see :meth:`~tk.run.prefetch.Observations.film_again`.
     """
     written, contacts = people.written, people.contacts
     kept = [held(result) for result in found]
@@ -89,7 +91,7 @@ def finish(
         if masks is not None:
             draft.masks = exchanged_masks(person.number, contacts, masks, result.frames)
         drafts.append(draft)
-    revisions, finisher = {}, _Finisher(task, len(written) == 1, note, within, task.setup.rig)
+    revisions, finisher = {}, _Finisher(task, len(written) == 1, note, within, task.setup.rig, film_again)
     if people.has_segments:
         finisher.second_pass([draft for draft in drafts if finisher.has_masks(draft)])
     for draft in drafts:
@@ -114,6 +116,7 @@ class _Finisher:
     note: Note
     within: Callable[[float], None]
     rig: Rig  # as used
+    film_again: Callable[[Sequence[float] | None], None] = lambda _: None
     late: NDArray[np.int64] = field(init=False)  # (C,) whole frames by which each video is late, as found
     offset_frames: Float = field(init=False)  # (C,) the same, not rounded
 
@@ -174,6 +177,7 @@ class _Finisher:
             if draft.person.subject.init is None:  # a given pose shows where the front is
                 draft.tracker = self._with_true_heading(draft)
         self._refine_cameras(drafts)
+        self.film_again(self.cameras.time_offset_s.tolist() if self.late.any() else None)
         for draft in drafts:
             self._find_lost(draft)
             (tracker, masks), subject = draft.tracker_and_masks, draft.person.subject

@@ -6,6 +6,7 @@ again). Messages pass through a channel, frames through memory that both process
 
     tracker ── task, span of frames, numbers of free slots ──► process ──► small images (tk.io.captures.film)
             ◄── _Ready: number of a slot with a frame, notes, _Failed, None after the last frame ──
+            ── delays of the cameras that the run has found, seconds, or None ──► small images once more, if any
 
 The system frees the memory when both processes have ended, however they end. When the tracker ends, the channel closes,
 and the process ends, too. The frames equal those of :class:`Serial` bit for bit.
@@ -24,7 +25,7 @@ import time
 import traceback
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, Protocol
@@ -34,7 +35,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import TkError, WorkerError
+from tk.io.captures.capture import Capture
 from tk.io.captures.film import Film
+from tk.io.captures.frames import FrameSet
 from tk.kernels.runtime import ensure_runtime
 from tk.model.cameras.camera import Rig
 from tk.run import worker
@@ -72,6 +75,11 @@ class Observations(Protocol):
         Raises:
             TkError: a frame cannot be read; all frames before it have been returned.
         """
+        ...
+
+    def film_again(self, time_offset_s: Sequence[float] | None) -> None:
+        """After the last frame: take the small images again, with delays (C,) of the cameras that the run has found,
+        while the tracker does something else; None: they stay as they are."""
         ...
 
     def __enter__(self) -> Observations: ...
@@ -121,7 +129,6 @@ def observe(
     task: Task, note: Note, span: tuple[int, int | None], image_step: int, film: Film | None
 ) -> Iterator[tuple[Frame, Stopwatch]]:
     """Decode and segment frames in this process; ``span``: first frame, and the end, exclusive."""
-    shapes = [(camera.height, camera.width) for camera in task.setup.rig]
     with task.source.frames(*span) as frames:
         label = make_labeller(task, note)  # threads decode the first frames meanwhile
         while True:
@@ -130,7 +137,7 @@ def observe(
             if frame is None:
                 return
             if film is not None:
-                film.put(frame.index, [image[:h, :w] for image, (h, w) in zip(frame.images, shapes, strict=True)], note)
+                _keep(film, frame, task.setup.rig, note)
             watch.lap("decode")
             labels = label(frame)
             images = frame.halved if image_step == 2 else frame.images
@@ -139,6 +146,11 @@ def observe(
             labelled = Frame(frame.index, images, time=frame.time, **labels._asdict())
             watch.lap("masks")
             yield labelled, watch
+
+
+def _keep(film: Film, frame: FrameSet, rig: Rig, note: Note) -> None:
+    """Keep the images of a frame, without their padding."""
+    film.put(frame.index, [image[: c.height, : c.width] for image, c in zip(frame.images, rig, strict=True)], note)
 
 
 @dataclass(frozen=True)
@@ -153,6 +165,9 @@ class Serial:
     def frames(self, start: int, stop: int | None) -> Iterator[Observed]:
         for observation, watch in observe(self.task, self.note, (start, stop), self.image_step, self.film):
             yield observation, {**watch.laps, "wait": sum(watch.laps.values())}
+
+    def film_again(self, time_offset_s: Sequence[float] | None) -> None:
+        """There is no other process: the images are decoded when they are shown."""
 
     def __enter__(self) -> Serial:
         return self
@@ -233,7 +248,7 @@ class Ahead:
     """
 
     def __init__(self, task: Task, note: Note, image_step: int = 1, film: Film | None = None) -> None:
-        self._where, self._note = task.source.where, note
+        self._source, self._film, self._note = task.source, film, note
         self._layout = _Layout(task.setup.rig, image_step)
         most = max(_AHEAD_BYTES // self._layout.bytes, 1)
         slots = max(min(task.settings.ahead, most), 1)
@@ -244,7 +259,7 @@ class Ahead:
         self._free = list(range(first, slots + _SPARE))
         self._given = first - slots  # slots that the process has in advance
         self._dropped: deque[int] = deque()  # slots of frames that are no longer referenced
-        self._begun = False
+        self._begun = self._ended = False
         child = worker.take()
         self._process, self._channel = child.process, child.channel
         self._send(_Order(task, image_step, first, memory, film))
@@ -260,6 +275,7 @@ class Ahead:
             self._collect()
             message = self._receive()
             if message is None:
+                self._ended = True
                 return
             observation = self._take(message)
             yield observation, {**message.laps, "wait": time.perf_counter() - asked}
@@ -307,7 +323,7 @@ class Ahead:
                 message = self._channel.receive()
             except EOFError:
                 how = f"the process that decodes and segments its frames {signals.how_it_ended(self._process.wait())}"
-                raise WorkerError(f"{self._where}: {how}; ahead = 0 avoids this process") from None
+                raise WorkerError(f"{self._source.where}: {how}; ahead = 0 avoids this process") from None
             if isinstance(message, str):
                 self._note(message)
             elif isinstance(message, _Failed):
@@ -316,6 +332,13 @@ class Ahead:
                 raise RuntimeError("the process that decodes and segments frames failed:\n" + message.trace)
             else:
                 return message
+
+    def film_again(self, time_offset_s: Sequence[float] | None) -> None:
+        if not (self._ended and self._film is not None and isinstance(self._source, Capture)):
+            return
+        self._send(time_offset_s)
+        if time_offset_s is not None:
+            self._film.late_frames = self._source.shifted(time_offset_s).late_frames
 
     def __enter__(self) -> Ahead:
         return self
@@ -326,7 +349,7 @@ class Ahead:
     def close(self) -> None:
         """End the process. Closing twice is fine."""
         self._channel.close()
-        if self._begun:  # it ends by itself, and stores the kernels that it has compiled
+        if self._begun:  # it ends by itself, after the last small images, and stores the kernels that it has compiled
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(_PATIENCE_S)
         self._process.kill()
@@ -392,3 +415,13 @@ def _serve(tracker: Channel) -> None:
     for observation, watch in observe(order.task, tracker.send, span, order.image_step, order.film):
         slots.put(observation, watch)
     tracker.send(None)
+    film, source = order.film, order.task.source
+    if film is None or order.task.options.causal or not isinstance(source, Capture):
+        return
+    while isinstance(delays := tracker.receive(), int):  # slots that are free again
+        pass
+    if delays is not None:
+        film.clear()
+        with source.shifted(delays).some_frames(film.frames) as frames:
+            for frame in frames:
+                _keep(film, frame, order.task.setup.rig, tracker.send)

@@ -150,7 +150,9 @@ def track_task(
                     note(line)
                 found = read_result(output).people
                 with one_thread():
-                    finished = finish(found, task, loop.people, masks, note, reporter.within)
+                    finished = finish(
+                        found, task, loop.people, masks, note, reporter.within, plan.observations.film_again
+                    )
                 if said or finished.revisions:
                     revise_people(output, finished.revisions, finished.cameras, said or None)
                 status = finished.status

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -89,7 +88,8 @@ class Choice:
 
     Args:
         tracker: with the person's body.
-        shown, evidence: two scales of what a frame shows, and its costs, by its place among the K.
+        shown, evidence: two scales of what a frame shows, and its costs, by its place among the K; they keep what they
+            return, because a frame's are asked for many times.
         frames: (K,) their numbers, ascending.
         follows: (K - 1,) whether the person was tracked in all frames between two neighbouring ones.
         poses: (K, D) the present ones.
@@ -113,8 +113,8 @@ class Choice:
         advance: Callable[[float], None],
     ) -> None:
         self.tracker, self.poses, self.variance = tracker, poses.copy(), np.zeros((len(poses), len(JOINTS)))
-        self._evidence = lru_cache(AT_ONCE)(evidence)
-        self._shown, self._frames, self._follows, self._share, self._advance = shown, frames, follows, share, advance
+        self._shown, self._evidence, self._advance = shown, evidence, advance
+        self._frames, self._follows, self._share = frames, follows, share
 
     def decide(self, modes: Float | None) -> None:
         """Track other poses of the body, then of its limbs, in both directions, and take the likeliest ones.
@@ -200,8 +200,7 @@ class Choice:
                 poses[k][np.ix_(known, one.dofs)] = one.begins[np.ix_(known, one.dofs)]
         rows = np.flatnonzero((poses != self.poses).any(axis=(0, 2)))
         for frames in (rows[k : k + AT_ONCE] for k in range(0, len(rows), AT_ONCE)):
-            seen = cache(self._shown)
-            poses[:, frames] = self._settled(alternatives, poses[:, frames], frames, seen)
+            poses[:, frames] = self._settled(alternatives, poses[:, frames], frames)
             for i in frames.tolist():
                 if len(differ := np.flatnonzero((poses[:, i] != self.poses[i]).any(axis=1))):
                     cost[differ, i] = self._more(i, poses[differ, i])
@@ -222,11 +221,11 @@ class Choice:
         pasts: list[Float | None] = [None] * len(alternatives)  # (D,) their poses in the frame before the last
         free = [k for k, one in enumerate(alternatives) if one.begins is None]
         for begin in range(0, len(order), AT_ONCE):
-            frames, seen = order[begin : begin + AT_ONCE], cache(self._shown)
+            frames = order[begin : begin + AT_ONCE]
             # most alternatives become the present pose at once: those that begin are settled together
             starts = begun.poses[:, frames].copy()
             if some := [alternatives[k] for k in free]:
-                starts[free] = self._settled(some, self._starts(some, frames, step), frames, seen)
+                starts[free] = self._settled(some, self._starts(some, frames, step), frames)
             self._advance(len(frames) / (2 * len(self.poses)))
             for n, i in enumerate(frames.tolist()):
                 joined, last, present, poses = self._joined(i, step), i - step, self.poses[i], starts[:, n]
@@ -239,7 +238,7 @@ class Choice:
                     ahead = np.repeat(present[None, None], len(some), axis=0)
                     for start, k, one in zip(ahead[:, 0], tracked, some, strict=True):
                         start[one.dofs] = self._predicted(i, step, result[k, last], pasts[k])[one.dofs]
-                    poses[tracked] = self._settled(some, ahead, frames[n : n + 1], seen)[:, 0]
+                    poses[tracked] = self._settled(some, ahead, frames[n : n + 1])[:, 0]
                 each = zip(alternatives, result, np.isfinite(known).tolist(), strict=True)
                 pasts = [self._past(*one, last) if joined else None for one in each]
                 differ = (poses != present).any(axis=1)
@@ -291,7 +290,6 @@ class Choice:
         alternatives: Sequence[Alternative],
         starts: Float,
         frames: NDArray[np.int64],
-        seen: Callable[[int], Pyramid],
     ) -> Float:
         """Return what the starts (A, N, D) of alternatives converge to in N frames; the present pose where that, or the
         start, is near the present pose."""
@@ -302,7 +300,7 @@ class Choice:
             own = far & np.array([one.limb is limb for one in alternatives])[:, None]
             if own.any():
                 start, shown = starts[own], frames[np.nonzero(own)[1]]
-                pyramid = Pyramid.of_all([seen(i) for i in shown.tolist()], LEVEL)
+                pyramid = Pyramid.of_all([self._shown(i) for i in shown.tolist()], LEVEL)
                 prior = tracker.prior(start, ANGLE_DEG)
                 result[own] = tracker.settle(pyramid, start, (LEVEL,), prior=prior, limb=limb).states
         if far.any():

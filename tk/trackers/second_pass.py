@@ -14,7 +14,9 @@ Then one problem of all frames, coupled by the motion, gives the poses and their
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -29,7 +31,7 @@ from tk.model.cameras.bundle import LONGEST_STEP, SEGMENT_M
 from tk.model.cues import landmarks
 from tk.model.cues.cue import Measured, in_frames
 from tk.model.cues.ray_costs import Evidence, residual_of
-from tk.model.masks.silhouettes import Pyramid
+from tk.model.masks.silhouettes import Pyramid, Views
 from tk.model.motion.coupling import MotionTerm
 from tk.optim.trajectory import Equations
 from tk.trackers.alternatives import ANGLE_DEG, AT_ONCE, LEVEL, Choice, apart
@@ -51,6 +53,9 @@ ROUNDS, WINDOW, OVERLAP = 2, 1000, 30
 # seconds: a person who stands still is seen once, not once a frame. CORRELATED_M was chosen on rendered people
 # (docs/experiments.md, Sigma); STILL_S is assumed.
 CORRELATED_M, STILL_S = 0.2, 1.0
+# Bytes of the masks that stay unpacked: those of 244 frames of four VGA cameras. Each frame's are asked for up to
+# twenty times, in the order of time, so those of a longer recording are unpacked each time.
+_UNPACKED_BYTES = 300_000_000
 
 
 class SecondPass:
@@ -84,8 +89,11 @@ class SecondPass:
         residual: Float,
         report: Callable[[float], None],
     ) -> None:
-        self.tracker, self._masks, self._report = tracker, masks, report
+        self.tracker, self._report = tracker, report
         self._measured, self._modes, self._colors = measured, modes, colors
+        frame = len(tracker.views.rig) * math.prod(tracker.views.rig.frame_shape)
+        self._kept = max(_UNPACKED_BYTES // frame, AT_ONCE)  # frames
+        self._pyramid = _unpacked(tracker.views, masks, measured, np.isfinite(residual[..., 0]), self._kept)
         self.tracked = np.flatnonzero(~lost)
         self._share = np.ones(len(poses))
         steps, seen = _steps(tracker.body.skeleton.joints(poses[self.tracked])), len(self.tracked)
@@ -115,7 +123,7 @@ class SecondPass:
         chosen = np.union1d(opening, _lowest(tracked, error, FIT_FRAMES - len(opening)))
         stature = height_m or tracker.body.dimensions.barefoot
         deviation = STATURE_DEVIATION if height_m else STATURE
-        seen = [self._pyramid(i) for i in chosen]
+        seen = [self._pyramid(i, 1) for i in chosen]
         fitted = tracker.fit(seen, self.poses[chosen], np.arange(len(chosen)), stature, deviation, tracker.body)
         tracker.take_body(fitted.body)
         if self._few:
@@ -197,7 +205,7 @@ class SecondPass:
         choice = Choice(
             self.tracker,
             lambda k: self._pyramid(frames[k], LEVEL + 1),
-            lambda k: self._evidence(frames[k]),
+            lru_cache(self._kept)(lambda k: self._evidence(int(frames[k]))),
             frames,
             np.diff(rows) == np.diff(frames),
             self.poses[frames],
@@ -230,18 +238,28 @@ class SecondPass:
 
     def _together(self, frames: NDArray[np.int64]) -> Pyramid:
         """Return the finest scale of some frames."""
-        return Pyramid.of_all([self._pyramid(i) for i in frames], 0)
-
-    def _pyramid(self, i: int, scales: int = 1) -> Pyramid:
-        """Return the scales of the masks of frame i, and what was measured in it, by the cameras that are used."""
-        shown, used = self._masks[int(i)], np.isfinite(self.residual[i, :, 0])
-        if not used.all():
-            shown = np.where(used[:, None, None], shown, np.uint8(0))
-        return self.tracker.views.pyramid(shown, scales, False, in_frames(self._measured, i, used))
+        return Pyramid.of_all([self._pyramid(i, 1) for i in frames], 0)
 
     def _evidence(self, i: int) -> Evidence:
         """Return the costs of frame i, with the colours that are known."""
-        return self.tracker.kept_evidence(self._pyramid(i), None if self._colors is None else self._colors[int(i)])
+        return self.tracker.kept_evidence(self._pyramid(i, 1), None if self._colors is None else self._colors[i])
+
+
+def _unpacked(
+    views: Views, masks: Sequence[NDArray[np.uint8]], measured: Measured, used: NDArray[np.bool_], kept: int
+) -> Callable[[int, int], Pyramid]:
+    """Return a function from a frame and a number of scales to the scales of the frame's masks, and what was measured
+    in it, by the cameras that are used, (F, C). The masks of ``kept`` frames stay unpacked."""
+
+    @lru_cache(kept)
+    def shown(i: int) -> NDArray[np.uint8]:
+        return masks[i] if used[i].all() else np.where(used[i][:, None, None], masks[i], np.uint8(0))
+
+    @lru_cache(kept)
+    def pyramid(i: int, scales: int) -> Pyramid:
+        return views.pyramid(shown(int(i)), scales, False, in_frames(measured, i, used[i]))
+
+    return pyramid
 
 
 def _steps(joints: Float) -> Float:

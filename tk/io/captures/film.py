@@ -47,20 +47,22 @@ class Film:
         where: the folder, as messages name it.
         sizes: (C,) width and height of the images.
         file: where they are.
+        late_frames: (C,) delays of the cameras that the images are corrected by, whole frames.
         frames: which frames are kept; none until a run has chosen them.
     """
 
     where: Path
     sizes: Sequence[tuple[int, int]]
     file: NamelessFile
+    late_frames: tuple[int, ...] = ()
     frames: range = range(0)
     _end: int = field(default=0, init=False)  # bytes written
 
     @staticmethod
-    def in_folder(folder: Path, sizes: Sequence[tuple[int, int]]) -> Film | None:
+    def in_folder(folder: Path, sizes: Sequence[tuple[int, int]], late_frames: tuple[int, ...] = ()) -> Film | None:
         """Return a film in a folder; None if no file can be made there."""
         try:
-            return Film(folder, sizes, NamelessFile.in_folder(folder))
+            return Film(folder, sizes, NamelessFile.in_folder(folder), late_frames)
         except OSError:
             return None
 
@@ -85,6 +87,11 @@ class Film:
             note(f"{self.where}: no small images can be kept there ({reason}): the videos are decoded twice")
             return
         self._end += size
+
+    def clear(self) -> None:
+        """Remove all images."""
+        self.file.truncate(0)
+        self._end = 0
 
     def places(self) -> dict[int, NDArray[np.int64]]:
         """Return the frames in the file, and where the images of each begin and end, (C + 1,) bytes."""
