@@ -99,7 +99,8 @@ def find_person(
     if not hypotheses and not clear:
         raise CaptureError(
             f"no pose of a person explains the masks: the best one leaves {least:.0%} of their pixels unexplained; "
-            "check that the masks show one whole person, and the calibration"
+            "check that the masks show one whole person (not two who touch: start where they are apart), and the "
+            "calibration"
         )
     likeliest = sorted(range(len(alternatives)), key=lambda i: alternatives[i][0])[:FOLLOWED]
     for anchor, group in groupby([*clear, *(alternatives[i][1:] for i in sorted(likeliest))], itemgetter(0)):
