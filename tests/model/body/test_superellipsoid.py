@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from tests.model.figures import skin_of
 from tk.errors import ConfigError
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.superellipsoid import Superellipsoid, signed_power
+from tk.model.body.superellipsoid import Superellipsoid
 
 PIECES = skin_of(BodyDimensions.from_stature(1.75)).pieces
 seeds = st.integers(0, 2**32 - 1)
@@ -148,13 +148,6 @@ def test_eta_range_ends_at_the_planes():
     for piece in PIECES:
         z = piece.point(np.array(piece.eta_range), np.zeros(2))[:, 2]
         np.testing.assert_allclose(z, [piece.z_lower, piece.z_upper], atol=1e-12)
-
-
-@given(st.floats(-3, 3), st.floats(0.1, 3))
-@many
-def test_signed_power_is_odd(base, exponent):
-    assert signed_power(np.float64(-base), exponent) == -signed_power(np.float64(base), exponent)
-    assert signed_power(np.float64(abs(base)), exponent) == pytest.approx(abs(base) ** exponent)
 
 
 # Bad shapes
