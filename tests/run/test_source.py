@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 import tk
-from tests.conftest import EVERY_FRAME, QUICK, Silent, refused, run_clock
+from tests.conftest import EVERY_FRAME, QUICK, Silent, StopAt, refused, run_clock
 from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, NAMES, STATURE, walk
@@ -155,14 +155,9 @@ def test_frames_before_the_first_person_are_absent_and_the_others_as_if_tracking
 def test_a_run_that_began_with_an_empty_volume_is_resumed(
     begun: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int
 ) -> None:
-    class Stop(Silent):
-        def advance(self, frame: int, estimate: object) -> None:
-            if frame == stop:
-                raise KeyboardInterrupt
-
     run_clock(monkeypatch, EVERY_FRAME)
     part = tmp_path / "part.h5"
-    stopped = track_task(task(SETUP, LATE), part, Stop())
+    stopped = track_task(task(SETUP, LATE), part, StopAt(stop))
     # frames are in the file from the first person on; before, there is none
     assert (stopped.interrupted, stopped.frames) == (True, stop + 1 if stop >= EMPTY else 0)
     assert part.exists() == (stop >= EMPTY) and len(list(tmp_path.iterdir())) == (2 if part.exists() else 0)
@@ -263,11 +258,6 @@ def test_two_people_are_tracked_and_kept_apart(pair: tuple[Result, ...]) -> None
 def test_a_run_stopped_among_the_frames_and_among_the_second_passes_is_finished(
     pair: tuple[Result, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Stop(Silent):
-        def advance(self, frame: int, estimate: object) -> None:
-            if frame == 2:
-                raise KeyboardInterrupt
-
     def stop_at_person_1(finisher: Any, draft: Draft) -> Any:
         if draft.person.number == 1:
             raise KeyboardInterrupt
@@ -280,7 +270,7 @@ def test_a_run_stopped_among_the_frames_and_among_the_second_passes_is_finished(
 
     run_clock(monkeypatch, EVERY_FRAME)
     finish_one = offline._Finisher.revision
-    assert len(track(Stop(), resume=False)[0].frames) < COUNT
+    assert len(track(StopAt(2), resume=False)[0].frames) < COUNT
     with monkeypatch.context() as patch:
         patch.setattr(offline._Finisher, "revision", stop_at_person_1)
         stopped = track(Silent())
