@@ -227,15 +227,6 @@ def test_a_result_of_the_silhouette_tracker_follows_the_contract_and_can_be_exte
     assert np.shape(result.model["parts/shape"]) == (22, 4)
 
 
-def test_a_person_who_returns_after_most_of_a_second_is_found_again(copy: Path, tmp_path: Path) -> None:
-    for camera in (copy / "masks").iterdir():
-        for index in range(2, 11):
-            write_picture(camera / f"{index:06d}.png", np.zeros((120, 160), np.uint8))
-    run(copy, tmp_path / "r.h5", frames=(0, 14), causal=True)
-    status = read_result(tmp_path / "r.h5").status
-    assert (status[2:11] == Status.ABSENT).all() and status[-1] in (Status.RECOVERED, Status.TRACKED)
-
-
 def test_the_second_pass_does_not_change_frames_without_anybody(copy: Path, tmp_path: Path) -> None:
     for camera in (copy / "masks").iterdir():
         for index in (2, 3):
