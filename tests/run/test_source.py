@@ -283,7 +283,7 @@ def test_a_run_stopped_among_the_frames_and_among_the_second_passes_is_finished(
 
 def test_a_bystander_is_no_part_of_the_subject() -> None:
     notes: list[str] = []
-    found = list(estimates(task(PAIR, Rendered(MASKS.max(axis=0)), frames=(0, 2), people=(0,)), notes.append))
+    found = list(estimates(task(POSED, Rendered(MASKS.max(axis=0)), frames=(0, 2), people=(0,)), notes.append))
     assert {e.person for e in found} == {0} and "lost" not in {e.status for e in found}
     joints = np.array([e.joints for e in found])
     assert min(far_off(joints, who) for who in (0, 1)) < 0.04
@@ -303,10 +303,10 @@ def test_the_subject_position_chooses_the_person() -> None:
 def test_a_number_that_nobody_gets_is_an_error_or_a_note(tmp_path: Path) -> None:
     source = Rendered(MASKS.max(axis=0))
     with refused(CaptureError, "person 2 did not enter the working volume"):
-        track_task(task(PAIR, source, people=(2,), frames=(0, 1)), tmp_path / "r.h5", Silent())
+        track_task(task(POSED, source, people=(2,), frames=(0, 1)), tmp_path / "r.h5", Silent())
     assert not list(tmp_path.iterdir())
     reporter = Silent()
-    track_task(task(PAIR, source, people=(2, 1), causal=True, frames=(0, 1)), tmp_path / "r.h5", reporter)
+    track_task(task(POSED, source, people=(2, 1), causal=True, frames=(0, 1)), tmp_path / "r.h5", reporter)
     (found,) = read_result(tmp_path / "r.h5").people
     assert min(far_off(found.joints, who) for who in (0, 1)) < 0.04
     assert reporter.notes == [
@@ -377,16 +377,12 @@ def test_somebody_who_enters_later_can_be_chosen(second: tuple[Result, tuple[Sub
     assert [subject.body for subject in subjects] == [None, BODY]  # the subject is the one who is chosen
 
 
-@pytest.mark.parametrize(("people", "stops"), [((1,), (10,)), ((1, 0), (1, 10))])
-def test_a_run_with_somebody_who_enters_later_is_resumed(
-    second: tuple[Result, Any], everybody: tuple[Result, ...], tmp_path: Path, people: Choice, stops: Sequence[int]
-) -> None:
-    """Stopped before, and after the person enters."""
-    path, end = tmp_path / "part.h5", 12
-    for stop in stops:
-        track_entering(path, people, stop, resume=stop != stops[0])
-    whole = second[:1] if len(people) == 1 else everybody  # in the order in which they came
-    for one, other in zip(track_entering(path, people, end, resume=True), whole, strict=True):
+def test_a_run_with_somebody_who_enters_later_is_resumed(everybody: tuple[Result, ...], tmp_path: Path) -> None:
+    """Stopped before, and after the person enters; people are in the order in which they came."""
+    path, people, end = tmp_path / "part.h5", (1, 0), 12
+    for stop in (1, 10):
+        track_entering(path, people, stop, resume=stop != 1)
+    for one, other in zip(track_entering(path, people, end, resume=True), everybody, strict=True):
         assert (other.status[:end] != Status.ABSENT).any()
         np.testing.assert_array_equal(one.frames, other.frames[:end])
         np.testing.assert_array_equal(one.pose, other.pose[:end])

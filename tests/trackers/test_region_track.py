@@ -384,15 +384,14 @@ def test_tracking_starts_from_any_pose_in_any_frame(copy: Path, tmp_path: Path, 
 
 
 def test_the_volumetric_tracker_accepts_and_stores_a_body(
-    copy: Path, causal: Path, tracked: Path, tmp_path: Path
+    tiny: Path, causal: Path, tracked: Path, tmp_path: Path
 ) -> None:
     """One body serves both skins."""
-    without_first_pose(copy, ("da-vinci", "any"))
     for method, given in (("volumetric", causal), ("region", tracked)):
         path = tmp_path / f"{method}.h5"
-        track(open_capture(copy), path, CONFIG, method=method, frames=(6, 9), body=given, causal=True)
+        track(open_capture(tiny), path, CONFIG, method=method, frames=(0, 3), body=given, causal=True)
         found, expected = read_result(path), read_result(given)
-        assert found.frames.tolist() == [6, 7, 8] and not (found.status == Status.LOST).any()
+        assert not (found.status == Status.LOST).any()
         np.testing.assert_array_equal(found.model["parts/shape"], expected.model["parts/shape"])
-        truth = read_joints(copy / "truth.h5").positions[6:9]
+        truth = read_joints(tiny / "truth.h5").positions[:3]
         assert np.median(np.linalg.norm(found.joints - truth, axis=2)) < 0.08
