@@ -108,7 +108,7 @@ def test_degenerate_exponents_stay_finite(e1, e2):
 def area_per_sample(piece, spacing):
     """Area of the surface nearest to each sample, by a fine mesh, in units of the spacing squared."""
     samples = piece.point(*piece.samples(spacing))
-    mesh = piece.point(*np.meshgrid(np.linspace(*piece.eta_range, 500), np.linspace(-np.pi, np.pi, 501), indexing="ij"))
+    mesh = piece.point(*np.meshgrid(np.linspace(*piece.eta_range, 250), np.linspace(-np.pi, np.pi, 251), indexing="ij"))
     across, down = mesh[1:, 1:] - mesh[:-1, :-1], mesh[1:, :-1] - mesh[:-1, 1:]
     area = np.linalg.norm(np.cross(across, down), axis=-1) / 2
     middle = (mesh[1:, 1:] + mesh[:-1, :-1] + mesh[1:, :-1] + mesh[:-1, 1:]) / 4
