@@ -345,3 +345,16 @@ class Silent:
 
     def within(self, share: float) -> None:
         assert 0 < share <= 1
+
+
+class StopAt(Silent):
+    """A reporter during which somebody presses Ctrl-C, after a frame."""
+
+    def __init__(self, frame: int) -> None:
+        super().__init__()
+        self.frame = frame
+
+    def advance(self, frame: int, estimate: object) -> None:
+        super().advance(frame, estimate)
+        if frame == self.frame:
+            signal.raise_signal(signal.SIGINT)

@@ -15,7 +15,7 @@ import pytest
 import tk
 from tests.conftest import QUICK
 from tests.io.conftest import picture, write_video
-from tk.errors import CaptureError, ConfigError, ResultError
+from tk.errors import ConfigError, ResultError
 from tk.io import settings_file
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -84,11 +84,6 @@ def test_path_is_tracked_once_and_the_result_is_described_in_three_lines(tiny, t
     lines = repr(result).splitlines()
     assert len(lines) == 3 and all(len(line) < 120 for line in lines)
     assert "r.h5" in lines[0] and "3 frames" in lines[1]
-
-
-def test_missing_capture_is_reported_in_one_line(tmp_path):
-    with pytest.raises(CaptureError, match="nowhere"):
-        tk.open_capture(tmp_path / "nowhere")
 
 
 def test_notes_are_logged(copy, tmp_path, caplog):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from collections.abc import Callable
@@ -75,19 +74,6 @@ def test_track_without_output_takes_the_name_of_the_folder(
     assert ran.code == 0 and ran.err.splitlines()[0] == f"note: the result is {expected}" and expected.is_file()
     ran = tk("track", link, *command[2:])
     ran.complaint(expected.name, "exists", "--force")
-
-
-def test_track_finds_the_person(tk: Tk, tracked: Path, tiny: Path) -> None:
-    """With voxels of 7 cm and images of 160×120: a test of the whole chain, not of its accuracy."""
-    ran = tk("evaluate", tracked, tiny / "truth.h5", "--json")
-    assert ran.code == 0 and ran.messages == []
-    found = json.loads(ran.out)
-    assert (found["judged"], found["lost"], found["nan_frames"]) == (FRAMES, 0, 0)
-    assert found["raw"]["all"]["median_cm"] < 12
-    table = tk("evaluate", tracked, tiny / "truth.h5")
-    assert table.code == 0 and table.messages == []
-    assert table.out.splitlines()[2].startswith("all 15")
-    assert f"{FRAMES} frames judged: 0 lost" in table.out
 
 
 def test_masks_from_a_folder_and_chosen_cameras_are_used(

@@ -110,14 +110,6 @@ def test_adjustment_recovers_the_rig(wrong: float) -> None:
     assert 1e-5 < sigma[6] / 700 < 0.003  # of a focal length
 
 
-def test_held_intrinsics_do_not_move() -> None:
-    start, views = disturbed(0.05)
-    held = np.ones(9, bool)
-    start = replace(start, lenses=(replace(start.lenses[0], held=held), *start.lenses[1:]))
-    solved = adjust(start, views)
-    np.testing.assert_allclose(solved.state.lenses[0].values, start.lenses[0].values, rtol=1e-9)
-
-
 def test_held_out_views_choose_the_rational_model_where_it_is_right() -> None:
     recipe = replace(RECIPE, cameras=((30, 3.2, 1.4, "rational"), (85, 3.4, 2.0, "webcam")), shared=2, close=6)
     rig = make_rig(recipe)

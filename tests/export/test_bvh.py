@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from bvh import Bvh
 
-from tests.export.conftest import FPS, FRAMES, LOST, SKELETON, Write, poses
+from tests.export.conftest import FPS, FRAMES, SKELETON, Write, poses
 from tk.export import export, read_motion
 from tk.model.body.rotations import turn
 from tk.model.body.skeleton import JOINTS, build_skeleton
@@ -63,15 +63,6 @@ def test_lengths_in_centimetres(write: Write) -> None:
     centimetres = places(export(path, ["bvh"], force=True, bvh_units="cm").files[0], 3)
     for name, place in metres.items():
         np.testing.assert_allclose(centimetres[name], 100 * place, atol=1e-2, err_msg=name)
-
-
-def test_lost_frames_repeat_the_last_known_pose(write: Write) -> None:
-    written = export(write(), ["bvh"])
-    assert any("2 lost frames" in note for note in written.notes)
-    before = places(written.files[0], LOST[0] - 1)
-    for f in LOST:
-        for name, place in places(written.files[0], f).items():
-            np.testing.assert_array_equal(place, before[name])
 
 
 def test_rest_pose_is_a_t(write: Write) -> None:

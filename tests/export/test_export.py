@@ -198,14 +198,6 @@ def test_frames_without_numbers_are_not_known(write: Write) -> None:
         read_motion(path)
 
 
-def test_joints_in_another_order(write: Write) -> None:
-    path, other = write("a.h5"), write("b.h5")
-    with h5py.File(other, "r+") as file:
-        file["joints/position"][...] = file["joints/position"][()][:, ::-1]
-        file["joints/position"].attrs["names"] = list(JOINTS[::-1])
-    np.testing.assert_array_equal(read_motion(path)[0].points, read_motion(other)[0].points)
-
-
 def test_frames_lost_at_the_start_repeat_the_first_known_pose(write: Write) -> None:
     states = np.zeros(FRAMES, dtype=np.uint8)
     states[:3] = Status.LOST

@@ -17,7 +17,7 @@ from scripts.synthetic.capture import write_calibration
 from tests.conftest import Tk
 from tests.io.conftest import write_picture, write_video
 from tests.model.figures import draw_silhouettes
-from tests.model.ring import ring_of_cameras
+from tests.model.ring import ring_of_cameras, turned
 from tk.errors import CaptureError
 from tk.inspection.checks import inspect
 from tk.inspection.delays import best_shift
@@ -40,12 +40,7 @@ from tk.settings import Settings
 
 def turn_camera(folder: Path, camera: int, degrees: float) -> None:
     """Turn a camera of the calibration to the side."""
-    rig = open_capture(folder).rig
-    turn = cv2.Rodrigues(np.radians([0.0, degrees, 0.0]))[0]
-    cameras = list(rig)
-    old = cameras[camera]
-    cameras[camera] = replace(old, rotation=turn @ old.rotation, translation=turn @ old.translation)
-    write_calibration(Rig(tuple(cameras)), folder / "calibration.toml")
+    write_calibration(turned(open_capture(folder).rig, camera, degrees), folder / "calibration.toml")
 
 
 def test_good_capture_has_no_findings_and_gets_a_sheet(tk: Tk, tiny: Path, tmp_path: Path) -> None:

@@ -126,12 +126,6 @@ def test_darkness_offset_suppresses_the_noise_of_dark_windows():
     assert small.collinearity.astype(int).mean() < large.collinearity.mean()
 
 
-def test_equal_pictures_have_no_difference():
-    images, _ = scene(0)
-    statistic = measure(images, images)
-    assert not statistic.difference.any() and not statistic.collinearity.any()
-
-
 def test_buffers_are_cleared_between_measurements():
     images, plates = scene(0)
     statistic = measure(images, plates)

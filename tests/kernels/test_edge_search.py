@@ -114,41 +114,11 @@ def test_a_pair_finds_a_bars_two_sides():
     np.testing.assert_allclose(found[[2, 4]], 24)
 
 
-def test_of_several_pairs_the_one_of_the_right_length_wins():
-    """Eq. 12: at like strengths the length decides."""
-    image = picture((10, 20, 0, H, 200), (30, 50, 0, H, 200))
-    wide = search(image, line(PAIR, (28, 24), (48, 24), (-1, 0), (1, 0), 20))[0]
-    narrow = search(image, line(PAIR, (13, 24), (23, 24), (-1, 0), (1, 0), 20))[0]
-    assert wide[3] - wide[1] == pytest.approx(20, abs=1.5) and narrow[3] - narrow[1] == pytest.approx(10, abs=1.5)
-
-
-def test_a_single_point_takes_the_strongest_edge():
-    """Eq. 14, along the contour's normal; not the nearest."""
-    image = picture((0, 30, 0, H, 70), (36, W, 0, H, 250))
-    found = search(image, line(SINGLE, (30, 24), reach=10))[0]
-    assert found[0] == 1 and abs(found[1] - 35.5) <= 1
-
-
-def test_an_edge_along_the_line_is_none():
-    """Its gradient is perpendicular to the contour's normal: score 0 (eq. 11)."""
-    image = picture((0, W, 24, H, 200))
-    for kind in (PAIR, SINGLE):
-        assert not search(image, line(kind, (20, 24), (40, 24), (-1, 0), (1, 0)))[0].any()
-
-
 def test_no_edge_no_answer_and_no_lines_no_work():
     flat = picture()
     for kind in (PAIR, SINGLE):
         assert not search(flat, line(kind, (20, 24), (30, 24), (-1, 0), (1, 0))).any()
     assert search(flat, np.zeros((0, 11), np.float32)).shape == (0, 5)
-
-
-@pytest.mark.parametrize("at", [(-30, 24), (W + 30, 24), (30, -30), (30, H + 30), (1, 1), (W - 1, H - 1)])
-@pytest.mark.parametrize("kind", [PAIR, SINGLE])
-def test_lines_end_at_the_border(kind, at):
-    """The border itself is no edge."""
-    image = picture((0, W, 0, H, 200))
-    assert not search(image, line(kind, at, (at[0] + 5, at[1]), (-1, 0), (1, 0), 12)).any()
 
 
 def test_a_padded_picture_ends_where_it_ends():

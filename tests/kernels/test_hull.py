@@ -141,16 +141,6 @@ def test_surface_voxels_and_normals(shape, seed, share):
     assert not colors.any() and len(seen) == len(voxels)
 
 
-def test_normals_of_a_ball_point_outwards():
-    grid = np.stack(np.meshgrid(*[np.arange(33) - 16] * 3, indexing="ij"), axis=-1)
-    active = np.linalg.norm(grid, axis=-1) <= 12.3
-    voxels, normals, _, _ = shade(active, [[16.0, 16.0, 400.0]])
-    radial = grid.reshape(-1, 3)[voxels] / np.linalg.norm(grid.reshape(-1, 3)[voxels], axis=1, keepdims=True)
-    angle_deg = np.degrees(np.arccos(np.clip((normals * radial).sum(1), -1, 1)))
-    # a ball of 57 voxels sees the surface in steps: a few degrees is what it can tell
-    assert np.median(angle_deg) < 5 and angle_deg.max() < 15
-
-
 def in_sight_oracle(active, start, eye, samples_per_layer):
     """Whether a sampled line from ``start`` to ``eye`` meets no active voxel."""
     step = (eye - start) / np.abs(eye - start).max() / samples_per_layer
@@ -182,18 +172,6 @@ def test_visibility_agrees_with_sampled_lines_of_sight(eye):
     assert (seen.astype(bool) != expected(1)).mean() < 0.005  # float32 rounds a sample to another voxel now and then
     assert (seen.astype(bool) != expected(20)).mean() < 0.04  # one sample a layer passes by the corner of a voxel
     assert seen[cosine > 0.6].sum() > 0 and not seen[cosine < 0].any()
-
-
-def test_a_ball_hides_the_one_behind_it():
-    grid = np.stack(np.meshgrid(np.arange(40.0), np.arange(21.0), np.arange(21.0), indexing="ij"), axis=-1)
-    front, back = (np.linalg.norm(grid - (x, 10, 10), axis=-1) < r for x, r in ((30, 5.5), (10, 3.5)))
-    eye = [[200.0, 10.0, 10.0]]
-    voxels, _, _, seen = shade(front | back, eye)
-    of_back = back.ravel()[voxels]
-    assert seen[~of_back].sum() > 50
-    assert not seen[of_back].any()
-    _, _, _, alone = shade(back, eye)
-    assert alone.sum() > 20
 
 
 def test_colours_come_from_the_footprint_and_only_from_foreground():

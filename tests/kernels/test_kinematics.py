@@ -93,11 +93,6 @@ def test_place_equals_the_skeletons_transforms(seed):
     np.testing.assert_allclose(single, place_oracle(local, segment, poses.astype(np.float32)), rtol=0, atol=SINGLE)
 
 
-def test_the_zero_pose_moves_nothing():
-    local, segment = points_of(np.random.default_rng(1), 40)
-    np.testing.assert_allclose(place(local, segment, np.zeros((1, D)))[0], local, rtol=0, atol=1e-15)
-
-
 def test_angles_too_small_for_their_cosine():
     """1 − cos(1e-9) rounds to 0; the first order must remain."""
     poses = np.full((1, D), 1e-9)

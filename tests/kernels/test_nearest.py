@@ -81,27 +81,3 @@ def test_each_bit_of_the_patches_counts(patch):
     index = SurfaceIndex.build(positions, np.array([others, np.int64(1) << np.int64(patch)]), 0.1)
     found = nearest(index, np.zeros((1, 3)), np.array([patch]))
     np.testing.assert_allclose(index.positions[found[0]], positions[1], atol=1e-7)
-
-
-def test_reach_is_a_ball():
-    """A voxel in a corner of the cube that the rings cover is out of reach."""
-    index = SurfaceIndex.build(np.full((1, 3), 0.19), np.full(1, -1), 0.1)
-    query = np.zeros((1, 3)), np.zeros(1, int)
-    assert nearest(index, *query, reach_m=0.3)[0] == -1
-    assert nearest(index, *query, reach_m=0.34)[0] == 0
-
-
-@given(seeds, st.integers(1, 200), st.sampled_from([0.02, 0.1, 3.0]))
-@settings(max_examples=30)
-def test_index_holds_every_voxel_once_and_in_its_cell(seed, count, cell_m):
-    rng = np.random.default_rng(seed)
-    positions = rng.normal(0, 0.5, (count, 3))
-    index = SurfaceIndex.build(positions, np.arange(count), cell_m)
-    assert sorted(index.order) == list(range(count))
-    np.testing.assert_array_equal(index.positions, positions.astype(np.float32)[index.order])
-    np.testing.assert_array_equal(index.fits, index.order)
-    assert index.starts[0] == 0 and index.starts[-1] == count and len(index.starts) == np.prod(index.grid[4:]) + 1
-    cell = np.repeat(np.arange(len(index.starts) - 1), np.diff(index.starts))
-    ijk = np.stack(np.unravel_index(cell, index.grid[4:].astype(int)), -1)
-    inside = (index.positions - index.grid[:3]) / index.grid[3] - ijk
-    assert inside.min() > -1e-4 and inside.max() < 1 + 1e-4

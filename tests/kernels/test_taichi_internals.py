@@ -154,16 +154,6 @@ def test_kernels_of_others_keep_their_notes():
     assert "^" in str(caught.value)
 
 
-@ti.func
-def _twice(x):
-    return 2 * x
-
-
-@ti.kernel
-def _eight_times(x: ti.i32) -> ti.i32:
-    return _twice(_twice(_twice(x)))
-
-
 @pytest.mark.parametrize(
     "utilities, kernels",
     [

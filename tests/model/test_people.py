@@ -83,9 +83,8 @@ def test_people_close_together_before_four_cameras_are_told_apart() -> None:
     assert len(found) == 3 and max(nearest(found, places)) < 0.2
 
 
-@pytest.mark.parametrize("bend", [0.0, -0.3])
-def test_people_are_the_same_if_all_voxels_are_looked_at(bend: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    rig = Rig(tuple(replace(camera, distortions=np.array([bend, 0.0, 0.0, 0.0, 0.0])) for camera in RIG))
+def test_people_are_the_same_if_all_voxels_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig(tuple(replace(camera, distortions=np.array([-0.3, 0.0, 0.0, 0.0, 0.0])) for camera in RIG))
     masks = drawn([(-0.9, -0.5), (0.8, 0.9)], rig=rig).any(axis=0)
     masks[1, 100:140] = False
     uncertain = masks | np.roll(masks, 6, axis=2)

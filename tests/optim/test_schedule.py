@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tests.optim.problems import Evaluation
+from tk.optim import schedule
 from tk.optim.schedule import MAX_STEP_DEG, MAX_STEP_M, Float, Problem, ScheduleResult, descent_basis, optimise
 from tk.optim.smd import Objective
 
@@ -159,23 +160,12 @@ def test_second_pass_of_a_chain_keeps_torso_and_other_chains() -> None:
     assert np.abs(toy.asked_chains[-1] - toy.asked_chains[0]).max() > 0.01
 
 
-def test_the_second_pass_begins_where_the_first_ended() -> None:
-    toy = Toy()
-    solve(toy)
-    ((owner, pose),) = toy.held
-    np.testing.assert_array_equal(owner, [0, 1])
-    np.testing.assert_array_equal(toy.asked_chains[0], [pose, pose])
-    # and the mean of the last states is near the last that was asked for
-    assert 0 < np.abs(pose - toy.asked_full[-1][0]).max() < np.radians(2)
-
-
-def test_second_pass_has_a_smaller_tolerance() -> None:
-    toy = Toy()
-    result = solve(toy)
-    ((_, first),) = toy.held
-    coarse, fine = np.abs(first - TARGET)[4:].max(), np.abs(result.pose - TARGET)[4:].max()
-    assert fine < 0.3 * coarse
-    np.testing.assert_array_equal(result.pose[TORSO], first[TORSO])
+def test_second_pass_has_a_smaller_tolerance(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a first pass that leaves the chains far to go."""
+    fine = solve(Toy(full_moves_chains=False), TARGET + 0.4)
+    monkeypatch.setattr(schedule, "REFINE", 1.0)
+    rough = solve(Toy(full_moves_chains=False), TARGET + 0.4)
+    assert fine.iterations[0] == rough.iterations[0] and (fine.iterations[1:] > rough.iterations[1:]).all()
 
 
 def test_a_chain_does_not_depend_on_the_other() -> None:
@@ -217,24 +207,7 @@ def test_iterations_are_those_of_the_first_pass_and_of_each_chain_in_turn() -> N
         assert len(toy.asked_chains) == result.iterations[1 + slow] > 6
 
 
-def test_the_second_pass_has_the_iterations_of_the_first() -> None:
-    toy = Toy(noise=1.0)  # never within the tolerance
-    result = solve(toy, iterations=5)
-    assert result.iterations.tolist() == [5, 5, 5]
-    assert (len(toy.asked_full), len(toy.asked_chains)) == (5, 5)
-
-
 # --- seeds, bounds, settings ------------------------------------------------------------------------------------------
-
-
-def test_a_seed_decides_everything() -> None:
-    def run(seed: int) -> ScheduleResult:
-        return solve(Toy(noise=0.05, rng=np.random.default_rng(seed)))
-
-    first, again, other = run(1), run(1), run(2)
-    np.testing.assert_array_equal(first.pose, again.pose)
-    np.testing.assert_array_equal(first.iterations, again.iterations)
-    assert np.any(first.pose != other.pose)
 
 
 def test_no_iteration_moves_further_than_its_bound() -> None:

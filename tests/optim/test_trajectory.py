@@ -185,14 +185,6 @@ def test_without_iterations_the_start_is_returned():
     assert (found.state, found.reduced, found.converged) == (3.0, None, False)
 
 
-def test_damped_iterations_reach_the_same_minimum():
-    problem = Linear(3)
-    plain = minimise(problem.start, problem.linearise, move, [0], (100.0, 100.0)).state
-    damped = minimise(problem.start, problem.linearise, move, [0] * 100, (100.0, 100.0), damping=0.3).state
-    for one, other in zip(plain, damped, strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-8)
-
-
 @given(st.integers(0, 10**6))
 @settings(max_examples=10)
 def test_gauge_projection_removes_modes_and_keeps_what_is_orthogonal(seed):

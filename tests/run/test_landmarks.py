@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.conftest import Silent
+from tests.conftest import Silent, StopAt
 from tests.model.landmarks import landmarks_of
 from tests.run.test_source import BODY, ONE, POSES, RIG, SETTINGS, SETUP
 from tk.io.captures.frames import FrameSet
@@ -47,21 +46,12 @@ def network(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"tk.run.{module}.sources_of_masks", lambda _: ("learned", "both", "segmenter"))
 
 
-class Stop(Silent):
-    """Interrupts the run after frame 2."""
-
-    def advance(self, index: int, estimate: object) -> None:
-        super().advance(index, estimate)
-        if index == 2:
-            signal.raise_signal(signal.SIGINT)
-
-
 def test_result_has_the_landmarks_that_were_seen_and_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     """The second pass goes over frames of both runs."""
     whole, stopped = tmp_path / "whole.h5", tmp_path / "stopped.h5"
     options = TrackOptions(replace(SETTINGS, landmarks="auto"))
     track_task(Task(SETUP, ONE, options), whole, Silent())
-    assert track_task(Task(SETUP, ONE, options), stopped, Stop()).interrupted
+    assert track_task(Task(SETUP, ONE, options), stopped, StopAt(2)).interrupted
     assert REFINED not in read_result(stopped).model
     assert not track_task(Task(SETUP, ONE, options), stopped, Silent(), resume=True).interrupted
     result, found = read_result(whole), read_result(stopped)

@@ -71,15 +71,6 @@ def test_finished_hulls_are_kept_when_a_mask_is_damaged(tk: Tk, quick: Path, cop
         assert len(file["hull/offsets"]) == 4
 
 
-def test_an_older_hull_is_replaced(tiny: Path, tmp_path: Path) -> None:
-    for stop in (3, 2):
-        done = reconstruct(open_capture(tiny), tmp_path / "h.h5", CONFIG, Silent(), (0, stop), force=True)
-        assert done == stop
-    with h5py.File(tmp_path / "h.h5", "r") as file:
-        assert len(file["frames"]) == 2
-    assert [path.name for path in tmp_path.iterdir()] == ["h.h5"]
-
-
 @pytest.mark.parametrize(("option", "value"), [("frames", "14:"), ("frames", "3:3"), ("cameras", "cam9")])
 def test_bad_options(tk: Tk, quick: Path, tiny: Path, tmp_path: Path, option: str, value: str) -> None:
     ran = tk("reconstruct", tiny, "-o", tmp_path / "h.h5", "--config", quick, f"--{option}", value)

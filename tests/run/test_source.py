@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 import tk
-from tests.conftest import EVERY_FRAME, QUICK, Silent, refused, run_clock
+from tests.conftest import EVERY_FRAME, QUICK, Silent, StopAt, refused, run_clock
 from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, NAMES, STATURE, walk
@@ -155,14 +155,9 @@ def test_frames_before_the_first_person_are_absent_and_the_others_as_if_tracking
 def test_a_run_that_began_with_an_empty_volume_is_resumed(
     begun: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int
 ) -> None:
-    class Stop(Silent):
-        def advance(self, frame: int, estimate: object) -> None:
-            if frame == stop:
-                raise KeyboardInterrupt
-
     run_clock(monkeypatch, EVERY_FRAME)
     part = tmp_path / "part.h5"
-    stopped = track_task(task(SETUP, LATE), part, Stop())
+    stopped = track_task(task(SETUP, LATE), part, StopAt(stop))
     # frames are in the file from the first person on; before, there is none
     assert (stopped.interrupted, stopped.frames) == (True, stop + 1 if stop >= EMPTY else 0)
     assert part.exists() == (stop >= EMPTY) and len(list(tmp_path.iterdir())) == (2 if part.exists() else 0)
@@ -263,11 +258,6 @@ def test_two_people_are_tracked_and_kept_apart(pair: tuple[Result, ...]) -> None
 def test_a_run_stopped_among_the_frames_and_among_the_second_passes_is_finished(
     pair: tuple[Result, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Stop(Silent):
-        def advance(self, frame: int, estimate: object) -> None:
-            if frame == 2:
-                raise KeyboardInterrupt
-
     def stop_at_person_1(finisher: Any, draft: Draft) -> Any:
         if draft.person.number == 1:
             raise KeyboardInterrupt
@@ -280,7 +270,7 @@ def test_a_run_stopped_among_the_frames_and_among_the_second_passes_is_finished(
 
     run_clock(monkeypatch, EVERY_FRAME)
     finish_one = offline._Finisher.revision
-    assert len(track(Stop(), resume=False)[0].frames) < COUNT
+    assert len(track(StopAt(2), resume=False)[0].frames) < COUNT
     with monkeypatch.context() as patch:
         patch.setattr(offline._Finisher, "revision", stop_at_person_1)
         stopped = track(Silent())
@@ -293,7 +283,7 @@ def test_a_run_stopped_among_the_frames_and_among_the_second_passes_is_finished(
 
 def test_a_bystander_is_no_part_of_the_subject() -> None:
     notes: list[str] = []
-    found = list(estimates(task(PAIR, Rendered(MASKS.max(axis=0)), frames=(0, 2), people=(0,)), notes.append))
+    found = list(estimates(task(POSED, Rendered(MASKS.max(axis=0)), frames=(0, 2), people=(0,)), notes.append))
     assert {e.person for e in found} == {0} and "lost" not in {e.status for e in found}
     joints = np.array([e.joints for e in found])
     assert min(far_off(joints, who) for who in (0, 1)) < 0.04
@@ -313,10 +303,10 @@ def test_the_subject_position_chooses_the_person() -> None:
 def test_a_number_that_nobody_gets_is_an_error_or_a_note(tmp_path: Path) -> None:
     source = Rendered(MASKS.max(axis=0))
     with refused(CaptureError, "person 2 did not enter the working volume"):
-        track_task(task(PAIR, source, people=(2,), frames=(0, 1)), tmp_path / "r.h5", Silent())
+        track_task(task(POSED, source, people=(2,), frames=(0, 1)), tmp_path / "r.h5", Silent())
     assert not list(tmp_path.iterdir())
     reporter = Silent()
-    track_task(task(PAIR, source, people=(2, 1), causal=True, frames=(0, 1)), tmp_path / "r.h5", reporter)
+    track_task(task(POSED, source, people=(2, 1), causal=True, frames=(0, 1)), tmp_path / "r.h5", reporter)
     (found,) = read_result(tmp_path / "r.h5").people
     assert min(far_off(found.joints, who) for who in (0, 1)) < 0.04
     assert reporter.notes == [
@@ -387,16 +377,12 @@ def test_somebody_who_enters_later_can_be_chosen(second: tuple[Result, tuple[Sub
     assert [subject.body for subject in subjects] == [None, BODY]  # the subject is the one who is chosen
 
 
-@pytest.mark.parametrize(("people", "stops"), [((1,), (10,)), ((1, 0), (1, 10))])
-def test_a_run_with_somebody_who_enters_later_is_resumed(
-    second: tuple[Result, Any], everybody: tuple[Result, ...], tmp_path: Path, people: Choice, stops: Sequence[int]
-) -> None:
-    """Stopped before, and after the person enters."""
-    path, end = tmp_path / "part.h5", 12
-    for stop in stops:
-        track_entering(path, people, stop, resume=stop != stops[0])
-    whole = second[:1] if len(people) == 1 else everybody  # in the order in which they came
-    for one, other in zip(track_entering(path, people, end, resume=True), whole, strict=True):
+def test_a_run_with_somebody_who_enters_later_is_resumed(everybody: tuple[Result, ...], tmp_path: Path) -> None:
+    """Stopped before, and after the person enters; people are in the order in which they came."""
+    path, people, end = tmp_path / "part.h5", (1, 0), 12
+    for stop in (1, 10):
+        track_entering(path, people, stop, resume=stop != 1)
+    for one, other in zip(track_entering(path, people, end, resume=True), everybody, strict=True):
         assert (other.status[:end] != Status.ABSENT).any()
         np.testing.assert_array_equal(one.frames, other.frames[:end])
         np.testing.assert_array_equal(one.pose, other.pose[:end])

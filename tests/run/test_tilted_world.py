@@ -2,58 +2,21 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import h5py
 import numpy as np
-import pytest
-import tomli_w
 from scipy.spatial.transform import Rotation
 
 from tests.conftest import QUICK, track
 from tk.io import settings_file
-from tk.io.captures.calibration import camera_table
 from tk.io.captures.capture import open_capture
-from tk.io.results.reader import read_joints, read_result
+from tk.io.results.reader import read_result
 from tk.model.cameras.tracker_frame import seen_from
 from tk.model.cameras.up import up_text
 from tk.model.cameras.volume import Volume
 
 TURN = Rotation.from_euler("xyz", [-1.2, 0.3, 0.5]).as_matrix()
-
-
-@pytest.fixture(scope="module")
-def tilted(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The tiny capture with its world turned by :data:`TURN`."""
-    folder = tmp_path_factory.mktemp("tilted") / "capture"
-    shutil.copytree(tiny, folder)
-    original = open_capture(tiny)
-    tables: dict[str, object] = {}
-    for camera in original.rig:
-        turned = replace(camera, rotation=camera.rotation @ TURN.T)
-        tables[camera.name] = camera_table(turned)
-    (folder / "calibration.toml").write_text(tomli_w.dumps(tables))
-    side = 1.15 * max(original.volume.size)
-    settings = {
-        "up": (3 * TURN[:, 2]).tolist(),
-        "volume": {"center": (TURN @ original.volume.center).tolist(), "size": [side] * 3},
-    }
-    (folder / "capture.toml").write_text(tomli_w.dumps(settings))
-    return folder
-
-
-def test_the_person_is_tracked_in_a_tilted_world(tiny: Path, tilted: Path, tmp_path: Path) -> None:
-    path = tmp_path / "r.h5"
-    track(open_capture(tilted), path, settings_file.from_toml(QUICK), method="volumetric", frames=(0, 3))
-    with h5py.File(path) as file:
-        up = file.attrs["up"]
-    np.testing.assert_allclose(open_capture(tilted).up_axis, TURN[:, 2], atol=1e-12)
-    assert up == open_capture(tilted).up  # the very text
-    truth = read_joints(tiny / "truth.h5").positions[:3] @ TURN.T
-    found = read_result(path).joints
-    assert np.linalg.norm(found - truth, axis=-1).mean() < 0.10
 
 
 def test_results_do_not_depend_on_the_worlds_rotation(unposed: Path, tmp_path: Path) -> None:

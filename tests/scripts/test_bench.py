@@ -10,33 +10,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from scripts import bench
-from scripts.bench import Run, Stage, counted_launches, main, median_ms
-from tk.kernels.nearest import SurfaceIndex, nearest
-
-
-def test_launches_are_counted_by_kernel_only_inside_the_block() -> None:
-    points = np.zeros((3, 3))
-    index = SurfaceIndex.build(points, np.full(3, -1), 0.1)
-    patch = np.zeros(3, np.int32)
-    with counted_launches() as counts:
-        nearest(index, points, patch)
-        nearest(index, points, patch)
-    nearest(index, points, patch)
-    assert dict(counts) == {"nearest_kernel": 2}
-
-
-def test_ratio_is_peer_over_ours() -> None:
-    assert Stage("hull", 2.0, {"peer": 50.0}).ratios == {"peer": 25.0}
-
-
-def test_first_call_does_not_count() -> None:
-    calls: list[int] = []
-    assert median_ms(lambda: calls.append(1), repeats=3) >= 0
-    assert len(calls) == 4
+from scripts.bench import Run, main
 
 
 def here(*_: object, **__: object) -> Any:

@@ -26,15 +26,6 @@ def test_frames_of_a_slow_motion_are_compared_as_far_apart_as_allowed() -> None:
     assert chosen(list(range(10)), [step] * 10) == [0, 3, 6, 9]
 
 
-def test_needed_frames_and_the_ends_of_stretches_are_compared() -> None:
-    frames = [0, 1, 2, 3, 4, 8, 9, 10]
-    assert chosen(frames, [0.01] * 8, needed=(2,)) == [0, 2, 4, 5, 7]
-
-
-def test_a_single_frame_is_compared() -> None:
-    assert chosen([7], [1.0]) == [0]
-
-
 @given(st.lists(st.tuples(st.integers(1, 2), st.floats(0.01, 1.0), st.booleans()), min_size=1, max_size=40))
 def test_between_compared_frames_little_is_said(rows: list[tuple[int, float, bool]]) -> None:
     gaps, share, must = zip(*rows, strict=True)

@@ -143,32 +143,6 @@ def test_poses_with_similar_costs_in_one_frame_all_become_hypotheses(monkeypatch
     assert error(SKELETON.joints(hypotheses[1].poses[0])[None], inside[None])[0] < 1e-6
 
 
-@pytest.mark.parametrize(("count", "searched"), [(4, 1), (1, 2)])
-def test_limbs_of_an_improbable_pose_with_the_same_trunk_are_searched_in_a_single_frame_only(
-    count: int, searched: int, monkeypatch
-) -> None:
-    right = placed(arms(standing_pose(SKELETON), (1, 0.6, 0.3), (0.2, 1, -0.6)), 0.6)
-    wrong = placed(arms(standing_pose(SKELETON), (0.2, 0.3, 1), (-0.3, 1, 0.6)), 0.6)
-    masks = draw_silhouettes(BODY, RIG, np.array([right] * count))
-    frames = [Frame(i, np.zeros(0, np.uint8), m) for i, m in enumerate(masks)]
-    tracker = tracker_of()
-    monkeypatch.setattr(
-        tracker, "settle", lambda _, starts, *__: BatchSolution(np.array(starts), np.zeros(0), np.zeros(3, np.int32))
-    )
-    starts = tracker.world.poses_in(np.array([right, *3 * [wrong]]))
-    monkeypatch.setattr("tk.trackers.proposals.anywhere.gait.figures", lambda *_: starts)
-    monkeypatch.setattr("tk.trackers.proposals.opposite.propose", lambda *_: starts)
-    inside = tracker.world.poses_in(right)
-    monkeypatch.setattr(
-        Evidence, "cost", lambda _, __, poses: np.array([20.0 if np.allclose(p, inside) else 30.0 for p in poses])
-    )
-    monkeypatch.setattr(tracker, "mean_residual", lambda _, poses, __: np.full(len(poses), 0.1))
-    asked: list[np.ndarray] = []
-    monkeypatch.setattr(tracker, "improved", lambda _, pose: asked.append(pose) or pose)
-    find_person(tracker, [tracker.see(frame) for frame in frames[:1]] * count)
-    assert len(np.unique(asked, axis=0)) == searched
-
-
 @pytest.mark.parametrize("stature", [1.2, 1.6, 1.95])
 def test_estimated_stature_hardly_depends_on_the_pose(stature: float) -> None:
     body = build_cone_body(BodyDimensions.from_stature(stature))

@@ -79,12 +79,6 @@ def test_wrong_pose_raises_the_baseline_slowly() -> None:
         baseline.learn(halves(before + 0.2))
 
 
-def test_state_is_restored() -> None:
-    baseline, other = learned(), ResidualBaseline(VIEWS, 0.02)
-    other.state = baseline.state
-    np.testing.assert_array_equal(other.excess(np.full(VIEWS, 0.2)), baseline.excess(np.full(VIEWS, 0.2)))
-
-
 def test_variance_grows_with_the_squared_residual_and_is_never_smaller_than_normal() -> None:
     half = LEVEL / 2
     np.testing.assert_allclose(variance_factor(np.full((3, VIEWS, 2), 3 * half)), 9.0)

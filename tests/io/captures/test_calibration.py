@@ -120,6 +120,11 @@ MATRIX = [[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]]
         ("size", [64, -48], "two positive whole numbers"),
         ("size", [64.5, 48.0], "two positive whole numbers"),
         ("fisheye", "no", "fisheye = 'no' must be true or false"),
+        ("translation", [0.0, 1e308, 0.0], "translation holds 1e+308, which is too large"),
+        ("rotation", [1e300, 0.0, 0.0], "rotation holds"),
+        ("distortions", [1e12, 0.0, 0.0, 0.0], "distortions holds"),
+        ("matrix", [[1e200, 0.0, 0.0], *MATRIX[1:]], "matrix holds"),
+        ("size", [10**6, 48], "65536 pixels a side"),
     ],
 )
 def test_a_bad_value_is_one_line_with_file_and_camera(tmp_path: Path, key: str, value: Any, complaint: str) -> None:

@@ -56,16 +56,6 @@ def test_images_of_a_video_are_read_in_order(tmp_path: Path, name: str) -> None:
     assert [read_tag(image) for image in read_all(clip, start=7)] == [(1, k) for k in range(7, 12)]
 
 
-def test_reading_into_a_view_equals_reading_into_an_array(tmp_path: Path) -> None:
-    write_video(tmp_path / "a.mp4", [picture(0, k) for k in range(3)])
-    clip = probe(tmp_path / "a.mp4")
-    larger = np.zeros((HEIGHT + 2, WIDTH + 2, 3), np.uint8)
-    with closing(clip.open()) as reader:
-        reader.read(larger[:HEIGHT, :WIDTH])
-    np.testing.assert_array_equal(larger[:HEIGHT, :WIDTH], read_all(clip)[0])
-    assert not larger[HEIGHT:].any() and not larger[:, WIDTH:].any()
-
-
 @pytest.mark.parametrize("first", [0, 1])
 @pytest.mark.parametrize("pattern", ["{:06d}.png", "frame_{:03d}.jpg"])
 def test_numbered_images_are_read_in_order(tmp_path: Path, first: int, pattern: str) -> None:

@@ -200,13 +200,6 @@ def test_unsupported_video_format_is_named(folder: Path, check: Import) -> None:
         import_project(folder, check.output)
 
 
-def test_two_videos_of_one_camera_are_refused(folder: Path, check: Import) -> None:
-    write_project(folder)
-    write_clips(folder / "videos-raw", ["cam1"], suffix=".avi")
-    with pytest.raises(VideoError, match=r"holds both cam1.avi and cam1.mp4; keep one of them"):
-        import_project(folder, check.output)
-
-
 def test_parallel_cameras_get_no_volume(folder: Path, check: Import) -> None:
     """The capture is written without a volume, which the user has to add."""
     document = tables(make_rig())

@@ -6,7 +6,6 @@ import json
 import pickle
 import runpy
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -200,15 +199,6 @@ def test_factorise_refuses_singular_matrices() -> None:
     np.testing.assert_allclose(found, K, atol=1e-9)
     np.testing.assert_allclose(rotation, skewed.rotation, atol=1e-12)
     np.testing.assert_allclose(translation, skewed.translation, atol=1e-9)
-
-
-def test_skew_is_kept(folder: Path, check: Import) -> None:
-    skew = np.array([[0, 12.0, 0], [0, 0, 0], [0, 0, 0]])
-    rig = Rig(tuple(replace(camera, matrix=camera.matrix + skew) for camera in make_rig(distorted=False)))
-    for camera in rig:
-        np.savetxt(folder / f"{camera.name}.txt", projection_matrix(camera))
-    write_clips(folder / "videos", ["cam1", "cam2", "cam3", "cam4"])
-    check(folder, rig)
 
 
 def test_folder_of_texts_is_not_a_project(folder: Path, check: Import) -> None:

@@ -12,7 +12,7 @@ from tk.kernels.cones import CONE, ELLIPSOID
 from tk.model.body.anthropometry import HAIR, BodyDimensions
 from tk.model.body.cone_body import SHAPE_NUMBERS, ConePart, build_cone_body, part_arrays
 from tk.model.body.gait_poses import standing_pose, walking_pose
-from tk.model.body.skeleton import JOINTS, build_skeleton, up_rotation
+from tk.model.body.skeleton import JOINTS, build_skeleton
 
 
 def surface_of(part: ConePart) -> np.ndarray:
@@ -75,14 +75,6 @@ def test_axes_of_limbs_end_near_joints():
             # a thigh's surface lies in front of the hip and behind the knee, an arm's in the elbow's crook
             offset = (0.02 if limb == "thigh" else 0.003) * DIMENSIONS.stature
             np.testing.assert_allclose(axis, expected, atol=offset)
-
-
-def test_body_turns_with_the_up_direction():
-    upright, lying = build_cone_body(DIMENSIONS), build_cone_body(DIMENSIONS, up="y")
-    pose = np.zeros(len(upright.skeleton.names))
-    _, a = points_of(upright, pose)
-    _, b = points_of(lying, pose)
-    np.testing.assert_allclose(a @ up_rotation("y").T, b, atol=1e-12)
 
 
 def test_packed_frames_place_parts_like_the_body():

@@ -3,7 +3,7 @@
 import numpy as np
 
 from tests.model.figures import DIMENSIONS, skin_of
-from tk.model.body.strips import CIRCLES, LIMBS, STEPS, build_strips, limb_pieces
+from tk.model.body.strips import CIRCLES, STEPS, build_strips, limb_pieces
 
 BODY = skin_of(DIMENSIONS)
 STRIPS = build_strips(BODY, range(len(BODY.pieces)))
@@ -19,26 +19,8 @@ def test_every_piece_has_its_circles():
         assert z.min() >= piece.z_lower - 1e-9 and z.max() <= piece.z_upper + 1e-9
 
 
-def test_product_of_normal_and_point_is_one():
-    for index, piece in enumerate(BODY.pieces):
-        mine = STRIPS.piece == index
-        eta, omega = np.moveaxis(STRIPS.angles[mine], -1, 0)
-        n = STRIPS.normals[mine]
-        np.testing.assert_allclose(np.sum(n * piece.point(eta, omega), axis=-1), 1, atol=1e-12)
-        unit = n / np.linalg.norm(n, axis=-1, keepdims=True)
-        np.testing.assert_allclose(unit, piece.normal(eta, omega), atol=1e-12)
-
-
 def test_circles_are_equal_lengths_apart():
     for index in limb_pieces(BODY):
         eta = STRIPS.angles[STRIPS.piece == index][:, 0, 0]
         gaps = np.linalg.norm(np.diff(BODY.pieces[index].point(eta, np.zeros_like(eta)), axis=0), axis=1)
         np.testing.assert_allclose(gaps, gaps.mean(), rtol=1e-3)
-
-
-def test_limbs_are_their_tapered_pieces():
-    pieces = [BODY.pieces[i] for i in limb_pieces(BODY)]
-    assert [piece.segment for piece in pieces] == list(LIMBS)
-    for piece in pieces:
-        assert piece.z_lower >= 0 and piece.z_upper < piece.radii[2], "tapered, cut at both ends"
-        assert piece.z_upper - piece.z_lower > 0.2

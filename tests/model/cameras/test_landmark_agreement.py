@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from tests.model.landmarks import body_points, landmarks_of
-from tests.model.ring import ring_of_cameras
+from tests.model.ring import ring_of_cameras, turned
 from tests.trackers.walker import BODY, walk
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.landmark_agreement import (
@@ -26,14 +25,6 @@ NETWORK_M = 0.03  # error of a network's landmarks
 POSES = walk(3)
 
 
-def with_turned(rig: Rig, c: int, degrees: float, axis: str = "y") -> Rig:
-    """Return the rig whose camera c is turned about an axis of its image: x is horizontal, y vertical."""
-    turn = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
-    cameras = list(rig)
-    cameras[c] = replace(rig[c], rotation=turn @ rig[c].rotation, translation=turn @ rig[c].translation)
-    return Rig(tuple(cameras))
-
-
 def seen(poses: np.ndarray = POSES, noise_m: float = NETWORK_M) -> list[np.ndarray]:
     """Return the landmarks (1, C, L, 4) of one person in each frame."""
     return [landmarks_of(RIG, BODY, pose, noise_m, seed=i)[None] for i, pose in enumerate(poses)]
@@ -45,7 +36,7 @@ def test_correct_cameras_are_confirmed() -> None:
 
 @pytest.mark.parametrize("c", [0, 2])
 def test_turned_camera_is_contradicted_and_the_others_are_confirmed(c: int) -> None:
-    evidence = evidence_for_cameras(with_turned(RIG, c, 10.0), seen())
+    evidence = evidence_for_cameras(turned(RIG, c, 10.0), seen())
     assert evidence[c] < -3.0
     assert (np.delete(evidence, c) > 0).all()
 
@@ -58,7 +49,7 @@ def test_frames_of_an_opening_count_as_one() -> None:
 def test_two_cameras_confirm_or_contradict_each_other() -> None:
     own = [one[:, :2] for one in seen()]
     assert (evidence_for_cameras(Rig(tuple(RIG)[:2]), own) > 3.0).all()
-    tilted = tuple(with_turned(RIG, 0, 10.0, "x"))[:2]  # turned about the vertical they agree on another place
+    tilted = tuple(turned(RIG, 0, 10.0, "x"))[:2]  # turned about the vertical they agree on another place
     assert (evidence_for_cameras(Rig(tilted), own) < 0.0).all()
 
 

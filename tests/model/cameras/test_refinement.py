@@ -9,7 +9,7 @@ import pytest
 
 from tests.model.body.test_body_fit import edgels_all_over, walk
 from tests.model.figures import BODY, draw_silhouettes, surface_points
-from tests.model.ring import ring_of_cameras
+from tests.model.ring import ring_of_cameras, turned
 from tk.errors import ConfigError
 from tk.io.captures.mask_store import MaskStore
 from tk.kernels.cones import CONE
@@ -259,8 +259,7 @@ def test_agreement_names_the_inconsistent_and_the_late_camera():
 def test_two_cameras_of_which_one_is_turned_sideways_contradict_each_other(turned_deg: float):
     """The tracked person stands where the rays of both cameras meet, so only the person's size is wrong."""
     rig = Rig(tuple(RIG)[:2])
-    turn = np.asarray(cv2.Rodrigues(np.radians([0.0, turned_deg, 0.0]))[0])
-    wrong = Rig((rig[0], replace(rig[1], rotation=turn @ rig[1].rotation, translation=turn @ rig[1].translation)))
+    wrong = turned(rig, 1, turned_deg)
     place = BODY.skeleton.joints(motion())[:, 0]
     pixels = [camera.project(place)[0] for camera in rig]
     rays = [camera.rays(seen) for camera, seen in zip(wrong, pixels, strict=True)]

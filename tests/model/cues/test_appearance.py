@@ -27,11 +27,6 @@ def test_to_yuv_is_opencvs():
     np.testing.assert_allclose(to_yuv(colors)[inside], expected[inside] - [0, 128, 128], atol=1.5)
 
 
-def test_grey_has_no_colour():
-    yuv = to_yuv(np.repeat([[10.0], [128.0], [255.0]], 3, axis=1))
-    np.testing.assert_allclose(yuv, [[10, 0, 0], [128, 0, 0], [255, 0, 0]], atol=1e-9)
-
-
 def test_learns_a_gaussian_a_channel():
     model, patch, colors = learned()
     for p in (0, 1):

@@ -14,7 +14,7 @@ from tk.model.body.cone_body import COLOR_GROUPS
 from tk.model.body.gait_poses import walking_pose
 from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import PartColors, color_bins
-from tk.model.cues.ray_costs import UNCERTAIN_COST, Evidence, RayGrid, mean_of_views, unpacked
+from tk.model.cues.ray_costs import UNCERTAIN_COST, Evidence, RayGrid, unpacked
 from tk.model.masks.silhouettes import share_wrong
 
 RIG = ring_of_cameras(3, width=120, height=160)
@@ -174,10 +174,3 @@ def test_images_of_different_sizes_are_handled():
     drawn = draw_silhouettes(BODY, narrow, POSES)
     total = by_view(Evidence.of(RayGrid(narrow, 160), masks))
     np.testing.assert_allclose(total, [share_wrong(d, masks) for d in drawn], atol=1e-6)
-
-
-@pytest.mark.parametrize("views", [[0], [0, 1], [0, 1, 2]])
-def test_mean_is_over_the_views_that_see_anybody(views):
-    cost = np.full((2, 3), np.nan)
-    cost[:, views] = [[0.2] * len(views), np.arange(len(views)) / 10]
-    np.testing.assert_allclose(mean_of_views(cost), [0.2, np.mean(np.arange(len(views)) / 10)])

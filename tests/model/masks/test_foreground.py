@@ -155,13 +155,6 @@ def test_masks_do_not_depend_on_earlier_frames(learned):
         np.testing.assert_array_equal(fresh.label(image)[0], mask)
 
 
-def test_padding_of_a_smaller_image_is_background(learned):
-    scene, _, foreground = learned
-    image, _ = with_person(scene, (40, 40, 200))
-    masks = foreground.label(expose(image, np.random.default_rng(7)))[0]
-    assert not masks[1, 100:].any() and not masks[1, :, 140:].any()
-
-
 def test_specks_are_removed_and_small_holes_filled(learned):
     """In images twice as large."""
     scene, clips, _ = learned

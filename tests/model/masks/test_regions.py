@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from tk.kernels.background import level_of
-from tk.model.masks.regions import enclosed, person_parts, trim_rim, without_penumbrae
+from tk.model.masks.mosaic import Mosaic
+from tk.model.masks.regions import person_parts, without_penumbrae
 
 SHAPE = (40, 60)
 
@@ -39,13 +40,6 @@ def test_a_thick_region_is_kept_where_its_statistic_is_strong(statistic, is_cert
     assert certain.any() == is_certain
 
 
-def test_enclosed_compares_shares_of_the_border():
-    patch = boxes((slice(10, 20), slice(10, 20)))
-    three_sides = boxes((slice(7, 23), slice(7, 20))) & ~patch
-    assert np.array_equal(enclosed(patch, three_sides, 0.6), patch)
-    assert not enclosed(patch, three_sides, 0.9).any()
-
-
 def test_the_largest_part_of_each_image_is_kept_however_weak_it_is():
     body, other = boxes((slice(10, 30), slice(5, 20))), boxes((slice(18, 28), slice(26, 36)))
     strong = levels(body, 100.0)
@@ -59,19 +53,11 @@ def test_a_weak_smaller_part_is_removed_and_a_strong_one_kept():
     np.testing.assert_array_equal(parts(body | edge, levels(body | edge, 100.0)), body | edge)
 
 
-def test_small_parts_are_removed_and_small_holes_filled():
-    body, hole, speck = (boxes(at) for at in ((slice(5, 35), slice(5, 30)), (slice(12, 15), slice(10, 14)), (2, 50)))
-    mask = (body & ~hole) | speck
-    strong = levels(mask, 100.0)
-    np.testing.assert_array_equal(parts(mask, strong, area_min=13), body)
-    np.testing.assert_array_equal(parts(mask, strong, area_min=12), body & ~hole)
-
-
-def test_rim_pixels_that_show_the_scene_are_removed():
-    person = boxes((slice(10, 30), slice(10, 40)))
-    swollen = boxes((slice(7, 33), slice(7, 43)))
-    contrast = np.where(person, 80, 2).astype(np.uint8)
-    np.testing.assert_array_equal(trim_rim(swollen.view(np.uint8), contrast, 0.3, 4), person)
-    # pixels without contrast deep inside are kept
-    contrast[18:22, 20:30] = 0
-    np.testing.assert_array_equal(trim_rim(swollen.view(np.uint8), contrast, 0.3, 4), person)
+def test_tightened_boxes_hold_the_set_pixels_and_a_margin():
+    mosaic = Mosaic.of(np.array([[4, 2, 20, 15], [0, 0, 0, 0], [0, 0, 30, 20]], np.int32), 2)
+    marks = np.zeros(mosaic.shape, np.uint8)
+    mosaic.part(marks, 0)[1, 6:9] = 1
+    tight = mosaic.tightened(marks, 3, 2)
+    np.testing.assert_array_equal(tight.boxes, [[7, 2, 9, 5], [0, 0, 0, 0], [0, 0, 0, 0]])
+    part = mosaic.part_of(marks, 0, tight.boxes[0])
+    assert part.shape == (5, 9) and part.sum() == 3 and part[1, 3:6].all()

@@ -1,14 +1,12 @@
 """Cleaning, scales and E_S of masks."""
 
 import numpy as np
-import pytest
 
 from tests.model.figures import draw_silhouettes
 from tests.model.ring import ring_of_cameras
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
-from tk.model.body.gait_poses import figures, hip_and_knee, walking_pose
-from tk.model.cues.ray_costs import pixel_rays
+from tk.model.body.gait_poses import walking_pose
 from tk.model.masks.silhouettes import Views, clean, share_wrong
 
 RIG = ring_of_cameras(2, width=101, height=133)
@@ -53,25 +51,3 @@ def test_share_of_wrong_pixels_follows_the_papers_definition():
     np.testing.assert_allclose(share_wrong(drawn, MASKS), expected)
     assert (expected > 0.1).all() and not share_wrong(MASKS, MASKS).any()
     assert np.isinf(share_wrong(MASKS, 0 * MASKS)).all()
-
-
-def test_rays_go_through_the_pixels():
-    rays = pixel_rays(RIG, 5)
-    x, y = 2 + 5 * 7, 2 + 5 * 11
-    pixels, _ = RIG[1].project(RIG[1].center + 2.0 * rays[1, 11, 7].astype(float)[None])
-    np.testing.assert_allclose(pixels, [[x, y]], atol=1e-3)
-
-
-def test_hypotheses_cover_headings_and_phases():
-    poses = figures(BODY.skeleton, 4, 3, np.array([1.0, 2, 3]))
-    assert poses.shape == (4 * (3 + 2), len(BODY.skeleton.names))
-    assert (poses[:, :3] == [1, 2, 3]).all()
-    assert len(np.unique(poses.round(6), axis=0)) == len(poses)
-    assert (poses >= BODY.skeleton.lower).all() and (poses <= BODY.skeleton.upper).all()
-
-
-def test_a_stride_is_periodic_and_bends_knees_backwards():
-    for phase in np.linspace(0, 1, 11):
-        assert hip_and_knee(phase) == pytest.approx(hip_and_knee(phase + 1))
-        assert hip_and_knee(phase)[1] > 0
-    assert hip_and_knee(0.0)[0] > hip_and_knee(0.5)[0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.joints import FOOT_POINTS
@@ -11,18 +10,6 @@ from tk.model.body.skeleton import JOINTS, build_skeleton
 from tk.model.motion.segments import foot_points, joint_positions
 
 BODY = BodyDimensions.from_stature(1.75)
-
-
-@pytest.mark.parametrize("up", ["z", "-y"])
-@pytest.mark.parametrize("paper", [False, True])
-def test_agrees_with_the_skeleton(up: str, paper: bool) -> None:
-    skeleton = build_skeleton(BODY, up, paper)
-    poses = np.random.default_rng(1).uniform(-1, 1, (7, len(skeleton.names)))
-    T = skeleton.segment_transforms(poses)
-    joints = joint_positions(skeleton, T)
-    for f, pose in enumerate(poses):
-        np.testing.assert_allclose(T[f], skeleton.segment_transforms(pose), atol=1e-12)
-        np.testing.assert_allclose(joints[f], skeleton.joints(pose), atol=1e-12)
 
 
 def test_feet_stand_on_the_floor() -> None:

@@ -81,7 +81,10 @@ class Camera:
 
     def to_camera(self, p_world: ArrayLike) -> Float:
         """Return world points (N, 3) in the camera frame, metres."""
-        return np.asarray(p_world, dtype=np.float64).reshape(-1, 3) @ self.rotation.T + self.translation
+        p_camera = np.asarray(p_world, dtype=np.float64).reshape(-1, 3) @ self.rotation.T
+        for a in range(3):  # by columns, as in `_pixels`: arithmetic on rows of two or three numbers is slow
+            p_camera[:, a] += self.translation[a]
+        return p_camera
 
     def project(self, p_world: ArrayLike) -> tuple[Float, Float]:
         """Project world points, lens distortion included.
@@ -103,7 +106,7 @@ class Camera:
 
     def _pixels(self, p_camera: Float) -> Float:
         """Return pixels (N, 2) of points (N, 3) in front of the camera, NaN beyond the fold of the distortion."""
-        xy = p_camera[:, :2] / p_camera[:, 2:]
+        xy = np.column_stack([p_camera[:, a] / p_camera[:, 2] for a in range(2)])
         squared = np.einsum("na,na->n", xy, xy)
         if self.fisheye:
             bent = np.arctan(np.sqrt(squared)) ** 2
@@ -120,8 +123,9 @@ class Camera:
                 k4, k5, k6 = rational
                 radial /= 1 + squared * (k4 + squared * (k5 + squared * k6))
             tangential = 2 * (xy @ np.array([p2, p1]))  # along the point's direction, like the radial part
-            xy = xy * (radial + tangential)[:, None] + squared[:, None] * np.array([p2, p1])
-        pixels = xy * self.matrix.diagonal()[:2] + self.matrix[:2, 2]
+            along = radial + tangential
+            xy = np.column_stack([xy[:, a] * along + squared * p for a, p in enumerate((p2, p1))])
+        pixels = np.column_stack([xy[:, a] * self.matrix[a, a] + self.matrix[a, 2] for a in range(2)])
         if self.matrix[0, 1] != 0.0:
             pixels[:, 0] += self.matrix[0, 1] * xy[:, 1]
         pixels[bent > self._fold] = np.nan

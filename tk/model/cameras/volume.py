@@ -76,5 +76,5 @@ class VoxelGrid:
     def centers(self, flat: NDArray[np.integer] | None = None) -> NDArray[np.float64]:
         """Return (N, 3) centres of the voxels with flat indices (all of them by default), metres."""
         index = np.arange(self.count) if flat is None else np.asarray(flat)
-        ijk = np.stack(np.unravel_index(index, self.shape), axis=-1)
-        return np.asarray(self.origin) + self.voxel_m * ijk
+        ijk = np.unravel_index(index, self.shape)
+        return np.column_stack([start + self.voxel_m * i for start, i in zip(self.origin, ijk, strict=True)])
