@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tk.errors import ResultError
-from tk.evaluation.details import flexion_deg
+from tk.evaluation.details import flexion_deg, normal_share
 from tk.evaluation.joints import LIMB_JOINTS, evaluate, evaluate_files, trunk_axes
 from tk.io.results.data import JointTrack
 from tk.io.results.status import Status
@@ -393,3 +393,9 @@ def test_joints_without_sigma_are_excluded_and_failures_count() -> None:
     assert plain["sigma"]["limbs"]["expected"]["1"] == pytest.approx(0.1987, abs=1e-4)
     assert plain["longest_limb_error"] == {"frames": 1, "first": 5, "last": 5}
     assert plain["flexion"]["elbow_l"]["mean_deg"] is None
+
+
+def test_normal_shares_are_those_of_three_dimensions() -> None:
+    lengths = np.linalg.norm(np.random.default_rng(0).normal(size=(200_000, 3)), axis=1)
+    for count in (0.5, 1, 2, 3):
+        assert normal_share(count) == pytest.approx((lengths < count).mean(), abs=0.005)
