@@ -31,7 +31,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from copy import deepcopy
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
@@ -267,19 +266,23 @@ class PeopleMasks:
         place = place_of(self._rig, [(view.camera, view.sighting) for view in views])
         if place is None:
             return None
-        person = self._empty(self._patches(place))
-        self._each(lambda c: self._segment(left, c, person), range(len(left)))
-        seen = deepcopy(person)
-        seen.agreement = None
+        seen, person = (self._empty(self._patches(place)) for _ in range(2))
         for view in views:
             seen.patches[view.camera], seen.landmarks[view.camera] = view.patch, view.landmarks
             self._put(seen, view.camera, view.found)
-        if self._agreement(seen).support > self._agreement(person).support:
-            person = seen
-        if not near(trunk(self._agreement(person).points), self._volume):
+        if not near(trunk(self._agreement(seen).points), self._volume):
             return None
-        self._compare(left, person, range(len(left)))
-        return self._carved(person)
+        self._each(lambda c: self._segment(left, c, person), range(len(left)))
+        for c in set(range(len(left))) - {view.camera for view in views}:
+            seen.masks[c], seen.uncertain[c], seen.landmarks[c] = (
+                person.masks[c],
+                person.uncertain[c],
+                person.landmarks[c],
+            )
+        seen.agreement = None
+        better = seen if self._agreement(seen).support > self._agreement(person).support else person
+        self._compare(left, better, range(len(left)))
+        return self._carved(better)
 
     def _in_one_place(self, *people: _Person) -> bool:
         """Return whether landmarks show the trunks of two people in one place: they are one person."""
@@ -306,9 +309,8 @@ class PeopleMasks:
             for sighting in self._sightings(left, c):
                 patch = sighting.patch(_BALL_MARGIN)
                 same = np.array_equal(patch.cut(left[c]), patch.cut(images[c]))
-                found += [
-                    _View(sighting, c, patch, *self._seen(image, c, patch)) for image in (left[c], images[c])[same:]
-                ]
+                pictures = [left[c]] if same else [left[c], images[c]]
+                found += [_View(sighting, c, patch, *self._seen(picture, c, patch)) for picture in pictures]
             return found
 
         return [view for each in self._each(views, cameras) for view in each]

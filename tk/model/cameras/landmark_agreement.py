@@ -111,19 +111,21 @@ def grouped(rig: Rig, cameras: Sequence[int], seen: Float) -> list[NDArray[np.in
         cameras: (S,) camera of each set.
         seen: (S, L, 4) sets of landmarks; NaN if unknown.
     """
-    view = np.asarray(cameras, np.int64)
-    found = _Pairs.of(_Sets.of(Rig(tuple(rig[c] for c in view)), seen)) if len(view) else None
-    if found is None:
+    if not len(seen):
         return []
+    view = np.asarray(cameras, np.int64)
+    found = _Pairs.of(_Sets.of(Rig(tuple(rig[c] for c in view)), seen))
     apart = view[found.pairs[:, 0]] != view[found.pairs[:, 1]]
     pairs, fit = found.pairs[apart], np.nan_to_num(found.fit[apart])
     # the two cameras of a pair support the person by the pair's own sets
     of_pair = (np.arange(len(view)) == pairs[..., None]).any(axis=1)
     fit[(view == view[pairs][..., None]).any(axis=1) & ~of_pair] = 0.0
-    same = view[:, None] == view
     people: list[NDArray[np.int64]] = []
     while True:
-        best = (fit > 0) & (fit >= np.where(same, fit[:, None, :], 0.0).max(axis=2))  # of its camera
+        best = np.zeros(fit.shape, np.bool_)
+        for own in (np.flatnonzero(view == c) for c in np.unique(view)):
+            best[np.arange(len(fit)), own[fit[:, own].argmax(axis=1)]] = True
+        best &= fit > 0
         support = np.where(best, fit, 0.0).sum(axis=1) * (best | ~of_pair).all(axis=1)
         if not support.any():
             return people
