@@ -51,6 +51,9 @@ FOLLOWED = 8
 # children's proportions and wide clothes need more. A visual hull that is lower by more than this shows a person who
 # bends, so its height is no estimate of the stature.
 MOST_STATURE_RATIO = 1.35
+# Standard deviation of the logarithm of the stature that one limb's landmarks show: 0.10 in 42 single frames of four
+# cameras, 0.09 with two.
+LIMB_SPREAD = 0.1
 #: the joints that a limb search does not move
 TRUNK = [JOINTS.index(name) for name in ("pelvis", "neck", *SHOULDERS, *HIPS)]
 
@@ -196,13 +199,21 @@ def _follow(
     return [TrajectoryHypothesis(one, float(mean)) for one, mean in zip(poses, means, strict=True)]
 
 
+def _most_shown(statures: Float) -> float:
+    """Return the stature, metres, where the density of statures (K,) that limbs show is largest: limbs with a landmark
+    of somebody else may be more than half, but they do not agree."""
+    at = np.linspace(np.log(LEAST_STATURE), np.log(GREATEST_STATURE), 400)
+    density = np.exp(-0.5 * ((at[:, None] - np.log(statures)) / LIMB_SPREAD) ** 2).sum(axis=1)
+    return float(np.exp(at[density.argmax()]))
+
+
 def stature_of(finder: ContourFinder, pyramids: Sequence[Pyramid], hull_m: float | None = None) -> float:
     """Return the stature, metres, that frames show.
 
-    Landmarks show it in any pose: median over the limbs in all frames. Without landmarks, it is the stature at which
-    an average body covers as many pixels as the silhouettes do: median over the views of all frames, against the mean
-    area of hanging and spread arms. The area hardly changes when a person bends or raises the arms. Clothes enlarge it,
-    raised arms enlarge the height of the visual hull; who bends has a low hull.
+    Landmarks show it in any pose: the stature that most limbs show in all frames. Without landmarks, it is the stature
+    at which an average body covers as many pixels as the silhouettes do: median over the views of all frames, against
+    the mean area of hanging and spread arms. The area hardly changes when a person bends or raises the arms. Clothes
+    enlarge it, raised arms enlarge the height of the visual hull; who bends has a low hull.
 
     Args:
         finder: of the cameras.
@@ -213,7 +224,7 @@ def stature_of(finder: ContourFinder, pyramids: Sequence[Pyramid], hull_m: float
     marked = [pyramid.measured.get(landmark_cue.NAME) for pyramid in pyramids]
     by_limb = [landmark_cue.statures(rig, seen) for seen in marked if seen is not None]
     if by_limb and len(known := np.concatenate(by_limb)):
-        return float(np.clip(np.median(known), LEAST_STATURE, GREATEST_STATURE))
+        return _most_shown(known)
     body: ConeBody = build_cone_body(AVERAGE_BODY)
     ratios: list[Float] = []
     for pyramid in pyramids:
