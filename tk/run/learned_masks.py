@@ -50,8 +50,8 @@ MASK_SOURCES = ("learned scene", "learned scene and segmenter", "segmenter")
 
 # Seconds of a span, between asked frames, and least number of asked frames of a span.
 _SPAN_S, _STEP_S, _LEAST = 10.0, 0.5, 8
-# Asked frames that the opening waits for; each takes a third of a second. With five, the person of `dance` without its
-# empty scene, who hardly moves at first, is 0.07 cm worse than with eight.
+# Asked frames that the opening waits for; each takes a third of a second. With five, somebody who hardly moves at
+# first is 0.07 cm worse than with eight (docs/experiments.md).
 _FIRST = 6
 # Asked frames that a source of unknown length is learned from, and how many come between two times of learning.
 _PAST, _EVERY = 16, 4

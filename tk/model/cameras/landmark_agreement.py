@@ -102,9 +102,9 @@ def grouped(rig: Rig, cameras: Sequence[int], seen: Float) -> list[NDArray[np.in
     """Return the sets of landmarks that show one person, for each person whom two cameras or more show: indices, one
     for each camera, the best supported person first.
 
-    Each pair of sets of two cameras proposes a person; the best set of each other camera that shows this person
+    Any two sets of different cameras propose a person; the best set of each other camera that shows this person
     supports it. The most likely person takes these sets; the next one is found among the others. People who touch are
-    told apart by their limbs, although the middles of their bodies are close in the images.
+    separated by their limbs, although the middles of their bodies are close in the images.
 
     Args:
         rig: the cameras.
@@ -117,7 +117,7 @@ def grouped(rig: Rig, cameras: Sequence[int], seen: Float) -> list[NDArray[np.in
     found = _Pairs.of(_Sets.of(Rig(tuple(rig[c] for c in view)), seen))
     apart = view[found.pairs[:, 0]] != view[found.pairs[:, 1]]
     pairs, fit = found.pairs[apart], np.nan_to_num(found.fit[apart])
-    # the two cameras of a pair support the person by the pair's own sets
+    # both cameras that propose a person support it by the sets that they propose
     of_pair = (np.arange(len(view)) == pairs[..., None]).any(axis=1)
     fit[(view == view[pairs][..., None]).any(axis=1) & ~of_pair] = 0.0
     people: list[NDArray[np.int64]] = []
