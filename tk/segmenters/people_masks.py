@@ -4,7 +4,7 @@ A network segments the person in the middle of a square. It is inaccurate for a 
 one person if a square shows several, and misses people whom others hide. The calibrated cameras solve this:
 
 1. The segmenter detects people in every image, and gets the square around each. Detections whose landmarks agree are
-   one person (:func:`~tk.model.cameras.landmark_agreement.grouped`); without landmarks, or where they do not agree,
+   one person (:func:`~tk.model.cameras.landmark_agreement.most_likely`); without landmarks, or where they do not agree,
    detections are matched by the middle of the body (:mod:`tk.model.masks.sightings`). In every other camera, also
    without a detection (from above, for example), the segmenter gets the square around each person in space.
 2. Where a person's landmarks in a camera show somebody else than in most cameras, the segmenter gets the square around
@@ -46,7 +46,7 @@ from tk.model.cameras.landmark_agreement import (
     associated,
     consensus,
     evidence_of_sets,
-    grouped,
+    most_likely,
     trunk,
 )
 from tk.model.cameras.volume import Volume
@@ -232,9 +232,9 @@ class PeopleMasks:
             views = self._of_others(known, views)
         new: list[_Person] = []
         unknown: list[_View] = []
-        while groups := grouped(self._rig, [v.camera for v in views], np.array([v.landmarks for v in views])):
-            members = [views[k] for k in groups[0]]
-            views = [view for k, view in enumerate(views) if k not in groups[0]]
+        while len(of_one := most_likely(self._rig, [v.camera for v in views], np.array([v.landmarks for v in views]))):
+            members = [views[k] for k in of_one]
+            views = [view for k, view in enumerate(views) if k not in of_one]
             joined = self._joined(left, members)
             if joined is None:
                 unknown += members
@@ -273,21 +273,18 @@ class PeopleMasks:
         if not near(trunk(self._agreement(seen).points), self._volume):
             return None
         self._each(lambda c: self._segment(left, c, person), range(len(left)))
-        for c in set(range(len(left))) - {view.camera for view in views}:
-            seen.masks[c], seen.uncertain[c], seen.landmarks[c] = (
-                person.masks[c],
-                person.uncertain[c],
-                person.landmarks[c],
-            )
+        others = np.setdiff1d(np.arange(len(left)), [view.camera for view in views])
+        seen.masks[others], seen.uncertain[others] = person.masks[others], person.uncertain[others]
+        seen.landmarks[others] = person.landmarks[others]
         seen.agreement = None
         better = seen if self._agreement(seen).support > self._agreement(person).support else person
         self._compare(left, better, range(len(left)))
         return self._carved(better)
 
-    def _in_one_place(self, *people: _Person) -> bool:
+    def _in_one_place(self, a: _Person, b: _Person) -> bool:
         """Return whether landmarks show the trunks of two people in one place: they are one person."""
-        a, b = (trunk(self._agreement(person).points) for person in people)
-        return bool(np.linalg.norm(a - b) < APART_M)
+        apart = trunk(self._agreement(a).points) - trunk(self._agreement(b).points)
+        return bool(np.linalg.norm(apart) < APART_M)
 
     def _alone(self, images: Images, people: Sequence[_Person], views: Sequence[_View]) -> list[_Person]:
         """Return those whom one camera shows: the views that match no other camera's."""

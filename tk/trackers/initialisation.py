@@ -53,7 +53,7 @@ FOLLOWED = 8
 MOST_STATURE_RATIO = 1.35
 # Standard deviation of the logarithm of the stature that one limb's landmarks show: 0.10 in 42 single frames of four
 # cameras, 0.09 with two.
-LIMB_SPREAD = 0.1
+_LIMB_SPREAD = 0.1
 #: the joints that a limb search does not move
 TRUNK = [JOINTS.index(name) for name in ("pelvis", "neck", *SHOULDERS, *HIPS)]
 
@@ -202,8 +202,8 @@ def _follow(
 def _most_shown(statures: Float) -> float:
     """Return the stature, metres, where the density of statures (K,) that limbs show is largest: limbs with a landmark
     of somebody else may be more than half, but they do not agree."""
-    at = np.linspace(np.log(LEAST_STATURE), np.log(GREATEST_STATURE), 400)
-    density = np.exp(-0.5 * ((at[:, None] - np.log(statures)) / LIMB_SPREAD) ** 2).sum(axis=1)
+    at = np.linspace(np.log(LEAST_STATURE), np.log(GREATEST_STATURE), 400)  # steps of 0.3 %
+    density = np.exp(-0.5 * ((at[:, None] - np.log(statures)) / _LIMB_SPREAD) ** 2).sum(axis=1)
     return float(np.exp(at[density.argmax()]))
 
 

@@ -16,7 +16,7 @@ from tk.model.cameras.landmark_agreement import (
     consensus,
     evidence_for_cameras,
     evidence_of_sets,
-    grouped,
+    most_likely,
 )
 from tk.model.cues.landmarks import log_ratio
 
@@ -136,23 +136,27 @@ def test_no_camera_agrees_without_a_pair_that_shows_one_person() -> None:
     assert not agree.any() and np.isnan(points).all()
 
 
-def test_sightings_of_two_people_who_stand_close_are_grouped_by_person() -> None:
+def test_sightings_of_two_people_who_stand_close_are_separated() -> None:
     """One camera sees both, another neither; the order is any."""
     people = two_people()
     sets = [(0, 1), (1, 2), (0, 0), (1, 1), (0, 2), (1, 0)]  # person, camera
-    groups = grouped(RIG, [c for _, c in sets], np.array([people[k, c] for k, c in sets]))
-    assert sorted([sets[i] for i in group] for group in groups) == [[(0, 1), (0, 0), (0, 2)], [(1, 2), (1, 1), (1, 0)]]
-    evidence = evidence_of_sets(RIG, [c for _, c in sets], np.array([people[k, c] for k, c in sets]), people[0])
+    cameras, seen = [c for _, c in sets], np.array([people[k, c] for k, c in sets])
+    found = most_likely(RIG, cameras, seen)
+    rest = np.setdiff1d(np.arange(len(sets)), found)
+    other = rest[most_likely(RIG, [cameras[k] for k in rest], seen[rest])]
+    groups = sorted([sets[k] for k in group] for group in (found, other))
+    assert groups == [[(0, 1), (0, 0), (0, 2)], [(1, 2), (1, 1), (1, 0)]]
+    evidence = evidence_of_sets(RIG, cameras, seen, people[0])
     assert ((evidence > 0) == [k == 0 for k, _ in sets]).all()
 
 
 def test_no_two_sightings_of_a_camera_are_one_person_and_no_sighting_is_one_alone() -> None:
     person = two_people()[0]
-    groups = grouped(RIG, [0, 0, 1], person[[0, 0, 1]])
-    assert [group.tolist() for group in groups] in ([[0, 2]], [[1, 2]])
-    assert grouped(RIG, [0, 0], person[[0, 0]]) == [] == grouped(RIG, [], np.zeros((0, 21, 4)))
+    assert most_likely(RIG, [0, 0, 1], person[[0, 0, 1]]).tolist() in ([0, 2], [1, 2])
+    assert not len(most_likely(RIG, [0, 0], person[[0, 0]]))
+    assert not len(most_likely(RIG, [], np.zeros((0, 21, 4))))
     unknown = np.full((2, 21, 4), np.nan)
-    assert grouped(RIG, [0, 1], unknown) == []
+    assert not len(most_likely(RIG, [0, 1], unknown))
     assert np.isnan(evidence_of_sets(RIG, [0, 1], person[:2], np.full((4, 21, 4), np.nan))).all()
 
 

@@ -98,39 +98,34 @@ def trunk(points: Float) -> Float:
     return np.asarray(points[_TRUNK].mean(axis=0))
 
 
-def grouped(rig: Rig, cameras: Sequence[int], seen: Float) -> list[NDArray[np.int64]]:
-    """Return the sets of landmarks that show one person, for each person whom two cameras or more show: indices, one
-    for each camera, the best supported person first.
+def most_likely(rig: Rig, cameras: Sequence[int], seen: Float) -> NDArray[np.int64]:
+    """Return the sets of landmarks that show the most likely person, as indices, at most one of each camera; none if no
+    two cameras show the same person.
 
     Any two sets of different cameras propose a person; the best set of each other camera that shows this person
-    supports it. The most likely person takes these sets; the next one is found among the others. People who touch are
-    separated by their limbs, although the middles of their bodies are close in the images.
+    supports it. People who touch are separated by their limbs, although the middles of their bodies are close in the
+    images.
 
     Args:
         rig: the cameras.
         cameras: (S,) camera of each set.
         seen: (S, L, 4) sets of landmarks; NaN if unknown.
     """
-    if not len(seen):
-        return []
     view = np.asarray(cameras, np.int64)
-    found = _Pairs.of(_Sets.of(Rig(tuple(rig[c] for c in view)), seen))
+    found = _Pairs.of(_Sets.of(Rig(tuple(rig[c] for c in view)), seen)) if len(view) else None
+    if found is None:
+        return view
     apart = view[found.pairs[:, 0]] != view[found.pairs[:, 1]]
     pairs, fit = found.pairs[apart], np.nan_to_num(found.fit[apart])
     # both cameras that propose a person support it by the sets that they propose
-    of_pair = (np.arange(len(view)) == pairs[..., None]).any(axis=1)
-    fit[(view == view[pairs][..., None]).any(axis=1) & ~of_pair] = 0.0
-    people: list[NDArray[np.int64]] = []
-    while True:
-        best = np.zeros(fit.shape, np.bool_)
-        for own in (np.flatnonzero(view == c) for c in np.unique(view)):
-            best[np.arange(len(fit)), own[fit[:, own].argmax(axis=1)]] = True
-        best &= fit > 0
-        support = np.where(best, fit, 0.0).sum(axis=1) * (best | ~of_pair).all(axis=1)
-        if not support.any():
-            return people
-        people.append(np.flatnonzero(best[support.argmax()]))
-        fit[:, people[-1]] = 0.0
+    proposing = (np.arange(len(view)) == pairs[..., None]).any(axis=1)
+    fit[(view == view[pairs][..., None]).any(axis=1) & ~proposing] = 0.0
+    best = np.zeros(fit.shape, np.bool_)
+    for own in (np.flatnonzero(view == c) for c in np.unique(view)):
+        best[np.arange(len(fit)), own[fit[:, own].argmax(axis=1)]] = True
+    best &= fit > 0
+    support = np.where(best, fit, 0.0).sum(axis=1) * (best | ~proposing).all(axis=1)
+    return np.flatnonzero(best[support.argmax()]) if support.any() else view[:0]
 
 
 def evidence_of_sets(rig: Rig, cameras: Sequence[int], seen: Float, person: Float) -> Float:

@@ -194,10 +194,8 @@ def locate(
 def place_of(rig: Rig, seen: Sequence[tuple[int, Sighting]]) -> SeenPerson | None:
     """Return where a person is by sightings, each with its camera; None if their lines of sight are parallel."""
     points = np.array([[sighting.center, sighting.top] for _, sighting in seen])
-    origins, rays = (
-        np.array([rig[c].center for c, _ in seen]),
-        np.array([rig[c].rays(p) for (c, _), p in zip(seen, points, strict=True)]),
-    )
+    origins = np.array([rig[c].center for c, _ in seen])
+    rays = np.array([rig[c].rays(both) for (c, _), both in zip(seen, points, strict=True)])
     center, top = (closest_to_lines(origins, rays[:, k]) for k in range(2))
     if center is None or top is None:
         return None
