@@ -439,7 +439,7 @@ def test_modes_as_likely_as_the_pose_add_to_sigma_and_change_no_pose(frames: int
     tracker, wrist = tracker_at(POSES[0]), JOINTS.index("wrist_l")
     arm = next(limb for limb in tracker.limbs if "wrist_l" in [JOINTS[k] for k in limb.joints])
     cheap, dear = np.stack([POSES[0], raised]), np.array([2.0, 0.5])
-    modes = np.full((frames, limbs.KEPT, len(raised)), np.nan)
+    modes = np.full((frames, limbs.CANDIDATES, len(raised)), np.nan)
     modes[frames // 2] = limbs.others(POSES[0], POSES[0], [limbs.Modes(arm, cheap, dear)])
     np.testing.assert_array_equal(modes[frames // 2, 0, arm.dofs], raised[arm.dofs])
     assert np.isnan(modes[frames // 2, 1]).all(), "the present pose is no other one"
@@ -463,7 +463,7 @@ def test_colors_choose_between_poses_that_the_masks_show_alike(place: str) -> No
     half = draw_silhouettes(BODY, RIG, np.array(list(both.values()))).max(axis=0)
     tracker, wrist = tracker_at(POSES[0]), JOINTS.index("wrist_l")
     arm = next(limb for limb in tracker.limbs if "wrist_l" in [JOINTS[k] for k in limb.joints])
-    modes = np.full((3, limbs.KEPT, len(POSES[0])), np.nan)
+    modes = np.full((3, limbs.CANDIDATES, len(POSES[0])), np.nan)
     modes[:, 0, arm.dofs] = both["raised"][arm.dofs]
     label = tracker.coarse_grid.render(tracker.body, tracker.world.poses_in(both[place][None])).label[0]
     group = np.append(COLOR_GROUPS.index("torso"), BODY.color_group)[label]  # of label 0: the trunk
@@ -482,7 +482,7 @@ def test_a_mode_that_one_frame_leaves_open_replaces_the_pose_where_it_is_likelie
     """The first pass has the arm at a wrong place in all frames, and has found the right one in the first frame."""
     raised = np.array([with_arm(pose, "l", (0.1, 1.0, 0.3), 15.0) for pose in POSES])
     tracker, wrist = tracker_at(POSES[0]), JOINTS.index("wrist_l")
-    modes = np.full((6, limbs.KEPT, raised.shape[1]), np.nan)
+    modes = np.full((6, limbs.CANDIDATES, raised.shape[1]), np.nan)
     arm = next(limb for limb in tracker.limbs if "wrist_l" in [JOINTS[k] for k in limb.joints])
     modes[0, 0, arm.dofs] = raised[0, arm.dofs]
     poses, _, sigma = tracker.second_pass(

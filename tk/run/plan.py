@@ -26,6 +26,7 @@ from tk.run.segmentation import mask_source, sees_landmarks, sources_of_masks
 from tk.run.task import RecordingOptions, Task, describe
 from tk.trackers.bodies import read_body
 from tk.trackers.judgement import STATE_MEANINGS
+from tk.trackers.proposals.limbs import CANDIDATES
 from tk.trackers.protocol import Tracker
 from tk.trackers.reason import MEANINGS
 from tk.trackers.registry import tracker_class
@@ -163,7 +164,7 @@ class Plan:
             reasons=MEANINGS,
             judged=True,
             deviation=tracker.reports_sigma,
-            modes=tracker.has_second_pass,
+            modes=CANDIDATES if tracker.has_second_pass else 0,
             camera_states=STATE_MEANINGS if tracker.reports_sigma else (),
             segment_names=SEGMENTS if tracker.has_segments else (),
             feet=tracker.has_segments,

@@ -120,7 +120,7 @@ class Choice:
         """Track other poses of the body, then of its limbs, in both directions, and take the likeliest ones.
 
         Args:
-            modes: (K, 2, D) poses of limbs that the first pass left open, NaN where it left none.
+            modes: (K, M, D) poses of limbs that the first pass left open, NaN where it left none.
         """
         limbs, every, first = self.tracker.limbs, np.arange(self.poses.shape[1]), self.poses.copy()
         arms = [limb for limb in limbs if limb.name.startswith("arm")]

@@ -80,7 +80,7 @@ class Estimate:
         surface: the hull's surface, if the tracker made one.
         deviation: (J,) m, standard deviation of each joint position along one axis, as computed: also where the reason
             says that it is not known. None if the tracker does not report it.
-        modes: (2, D) other poses of the limbs that the frame leaves open, see
+        modes: (M, D) other poses of the limbs that the frame leaves open, see
             :func:`tk.trackers.proposals.limbs.others`; None if no limb was searched for.
         residual: (C, 2) missing area (body outside the mask) and surplus area (mask outside the body) by camera, shares
             of the person's pixels, NaN for a camera that was not used; their sum is E_S. None if not measured.
@@ -344,7 +344,7 @@ class TwoPassTracker(Tracker, Protocol):
             residual: (F, C, 2) of the first pass; NaN where a camera was excluded.
             height_m: the subject's height, if known.
             measured: of F frames, in the first pass; None: nothing.
-            modes: (F, 2, D) other poses of the limbs that the first pass left open, as in :class:`Estimate`.
+            modes: (F, M, D) other poses of the limbs that the first pass left open, as in :class:`Estimate`.
             colors: (C, h, w) of F frames, as in :class:`Estimate`; None where they are not known.
             keep_body: leave the body as it is.
             report: receives the share of the work that is done.

@@ -65,7 +65,7 @@ class SecondPass:
         tracker: with the body and the cameras of this pass.
         masks: (C, H, W) of each frame, cleaned.
         measured: of F frames, see :mod:`tk.model.cues.cue`.
-        modes: (F, 2, D) other poses of the limbs that each frame leaves open; None if they are unknown.
+        modes: (F, M, D) other poses of the limbs that each frame leaves open; None if they are unknown.
         colors: (C, h, w) of each frame, as in :class:`~tk.trackers.protocol.Estimate`; None where they are unknown.
         poses: (F, D) of the first pass.
         lost: (F,) bool; such frames are not used and do not change.

@@ -86,7 +86,7 @@ class ResultMeta:
     reasons: tuple[str, ...] = ()  # meanings of the values of `/evidence/reason`
     judged: bool = False  # True if `/evidence/found` and `/evidence/origin` exist
     deviation: bool = False  # True if `/evidence/sigma` exists
-    modes: bool = False  # True if `/evidence/modes` exists
+    modes: int = 0  # number M of the poses of a limb in `/evidence/modes`; 0 if that does not exist
     camera_states: tuple[str, ...] = ()  # meanings of the values of `/evidence/camera`
     segment_names: tuple[str, ...] = ()  # names of the segments of `/segments/rotation`
     feet: bool = False  # True if `/feet/position` exists, the points `tk.model.body.joints.FOOT_POINTS`
@@ -207,7 +207,7 @@ class Result:
     found: NDArray[np.uint8] | None = None  # (F,) the reason that each frame itself shows, as ``reason``
     origin: NDArray[np.uint8] | None = None  # (F,) the status before the frame is judged
     deviation: Float | None = None  # (F, J) metres, sigma as computed, also where it is not known
-    modes: NDArray[np.float32] | None = None  # (F, 2, D) other poses of the limbs that the frame leaves open
+    modes: NDArray[np.float32] | None = None  # (F, M, D) other poses of the limbs that the frame leaves open
     camera_state: NDArray[np.uint8] | None = None  # (F, C) why a camera was left out, see meta.camera_states; 0: used
     image_shift: NDArray[np.float32] | None = None  # (F, C) how far each image has moved, share of its longer side
     residual: Float | None = None  # (F, C, 2) missing and surplus area, shares of the person's pixels

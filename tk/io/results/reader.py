@@ -258,7 +258,9 @@ class StoredPerson:
                     found[str(item)] = file.text(path, attribute, "")
                 elif isinstance(item, str) and item not in found:
                     found[item] = file.names(path, attribute) if exists else ()
-            if entry.optional:
+            if entry.optional == "modes":
+                found["modes"] = (*file.shapes.get(path, ()), 0, 0)[1]
+            elif entry.optional:
                 found.setdefault(entry.optional, exists)
         try:
             found["angles"] = tuple(

@@ -34,10 +34,10 @@ ATTRIBUTES = {
     "config": ("config_toml", str),
 }
 
-#: field that lists what a letter of a shape counts; `k` counts the angles of one joint
+#: field of ResultMeta that lists or numbers what a letter of a shape counts; `k` counts the angles of one joint
 COUNTED = {
     "D": "pose_names", "J": "joint_names", "S": "segment_names", "C": "residual_cameras", "T": "stages", "k": "names",
-    "L": "landmark_names",
+    "L": "landmark_names", "M": "modes",
 }  # fmt: skip
 
 
@@ -164,9 +164,9 @@ ROWS = (
         _NAMES, field="deviation", optional="deviation", valid=(0, MAX_DISTANCE_M),
     ),
     Dataset(
-        "evidence/modes", "F 2 D", "float32",
-        "other poses of the limbs that the frame leaves open, the cheapest and the next: angles in the columns of each "
-        "limb; NaN without one",
+        "evidence/modes", "F M D", "float32",
+        "other poses of the limbs that the frame leaves open, the cheapest first: angles in the columns of each limb; "
+        "NaN without one",
         {"names": "pose_names"}, field="modes", optional="modes",
     ),
     Dataset(
@@ -247,6 +247,10 @@ def prefix_of(person: int) -> str:
     return f"people/{person}/"
 
 
+def _number(counted: int | tuple[str, ...]) -> int:
+    return counted if isinstance(counted, int) else len(counted)
+
+
 def columns_of(meta: ResultMeta) -> dict[str, Column]:
     """Return the columns of a result by path."""
     columns = {}
@@ -255,7 +259,7 @@ def columns_of(meta: ResultMeta) -> dict[str, Column]:
             continue
         members = {str(getattr(i, "joint", i)): i for i in getattr(meta, entry.each)} if entry.each else {"": meta}
         for key, member in members.items():
-            counts = {letter: len(getattr(member, name, ())) for letter, name in COUNTED.items()} | {"F": 0}
+            counts = {letter: _number(getattr(member, name, ())) for letter, name in COUNTED.items()} | {"F": 0}
             attributes = {
                 name: getattr(member, source) if isinstance(source, str) else source
                 for name, source in entry.attributes.items()

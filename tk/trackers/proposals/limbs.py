@@ -21,15 +21,13 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-# Candidates of a limb that are refined; of a limb that is known to be misplaced; random candidates near its pose that
-# are screened beside the grid.
+# Candidates of a limb that are refined, and modes that are kept for the second pass, at most; candidates of a limb that
+# is known to be misplaced; random candidates near its pose that are screened beside the grid.
 CANDIDATES, MORE_CANDIDATES, NEARBY = 8, 32, 80
 # Screening stops at a candidate of which this share lies outside the silhouettes.
 OUTSIDE = 0.4
 # Poses that are proposed, at most.
 FINISHED = 2
-# Other poses of a limb that are kept for the second pass.
-KEPT = 2
 
 
 class Modes(NamedTuple):
@@ -111,19 +109,19 @@ def propose(finder: ContourFinder, seen: Seen, pose: Float, found: Sequence[Mode
 
 
 def others(pose: Float, before: Float, found: Sequence[Modes]) -> Float:
-    """Return (KEPT, D) other poses of the limbs that a frame leaves open, as angles in the columns of each limb: in row
-    0 the cheapest, in row 1 the next one; NaN without one.
+    """Return (CANDIDATES, D) other poses of the limbs that a frame leaves open, as angles in the columns of each limb,
+    the cheapest first; NaN without one.
 
     Args:
         pose, before, found: as for :func:`spread`.
     """
-    result = np.full((KEPT, len(pose)), np.nan)
+    result = np.full((CANDIDATES, len(pose)), np.nan)
     for one in found:
         limb, skeleton = one.limb, one.limb.skeleton
         poses = np.repeat(pose[None], 1 + len(one.poses), axis=0)
         poses[:, limb.dofs] = np.concatenate([before[None], one.poses])[:, limb.dofs]
         differ = skeleton.apart(poses, skeleton.joints(pose)) > SAME_POSE_M
-        kept = limb.distinct(poses, np.where(differ, np.append(0.0, one.cost), np.inf), KEPT)
+        kept = limb.distinct(poses, np.where(differ, np.append(0.0, one.cost), np.inf), CANDIDATES)
         result[: len(kept), limb.dofs] = kept[:, limb.dofs]
     return result
 
