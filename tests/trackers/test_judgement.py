@@ -76,6 +76,14 @@ def test_second_person_or_torn_mask_contradicts_no_pose() -> None:
     assert not suspect(residuals(0.3, 0.01)).any()
 
 
+def test_furniture_that_hides_most_of_a_person_from_one_camera_contradicts_no_pose() -> None:
+    hidden = residuals(0.07, 0.04)
+    hidden[:, 0] = 0.8, 0.1
+    assert not suspect(hidden).any()
+    hidden[:, :3] = 0.3, 0.3  # a wrong pose is wrong in most views
+    assert suspect(hidden).all()
+
+
 def test_only_frames_about_a_lasting_high_residual_are_suspect() -> None:
     short, lasting = residuals(0.04, 0.05), residuals(0.04, 0.05)
     short[4] = 0.2
