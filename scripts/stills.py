@@ -1,11 +1,12 @@
 """Track single frame sets: the hardest start, in any pose, without a height, an empty scene or other frames.
 
-    python -m scripts.stills CAPTURE… [--every 20] [--cameras A,B,…] [--people all] [--work DIR]
+    python -m scripts.stills CAPTURE… [--every 20] [--cameras A,B,…] [--people all] [--chairs] [--work DIR]
 
 Some frames of each capture become captures of one image a camera. The masks are a network's. Each is tracked, and
 compared with the capture's ``truth.h5``, or, without one, with a result of the whole capture. The table shows for each
 person the mean error of the joints, cm, the joints that are more than 15 cm off without a warning (see
-:mod:`scripts.faults`), and the joints that are so far off with their sigma, cm.
+:mod:`scripts.faults`), and the joints that are so far off with their sigma, cm. With ``--chairs`` each frame becomes
+four, in which a chair stands on one side of each person.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from scipy.optimize import linear_sum_assignment
 
 from scripts.any_start import Quiet
 from scripts.faults import SILENT_M, Outcome
+from scripts.furniture import SIDES, with_chairs
 from scripts.synthetic.capture import write_calibration
 from tk.errors import TkError
 from tk.io.captures.capture import Capture, open_capture
@@ -77,23 +79,29 @@ def described(outcome: Outcome | None) -> str:
     return f"{np.nanmean(error):5.2f} {np.count_nonzero(outcome.silent):2}{mark} {', '.join(far)}".rstrip()
 
 
-def compare(capture: Capture, frames: Sequence[int], people: str, work: Path) -> Iterator[str]:
-    """Yield a line of the table for each frame."""
+def compare(capture: Capture, frames: Sequence[int], people: str, chairs: bool, work: Path) -> Iterator[str]:
+    """Yield a line of the table for each still."""
     truth = people_of(capture, work)
     with capture.some_frames(frames) as reader:
         for frame in reader:
-            name = f"{capture.name}-{frame.index:04d}"
-            write_still(capture, frame.images, work / name)
-            reporter, result = Quiet(), work / f"{name}.h5"
-            try:
-                track(open_capture(work / name), result, RecordingOptions(people=people), reporter, force=True)
-            except TkError as error:
-                yield f"{name:28} refused: {error}"
-                continue
             true = positions_at(np.array([frame.index]), truth)[:, 0]
-            left_out = [note for note in reporter.notes if "left out" in note]
             known = true[np.isfinite(true).any(axis=(1, 2))]
-            yield f"{name:28} {'; '.join([*map(described, outcomes(result, known)), *left_out])}"
+            for side in range(SIDES) if chairs else (None,):
+                name = f"{capture.name}-{frame.index:04d}" + ("" if side is None else f"-chair{side}")
+                shown = frame.images if side is None else with_chairs(capture.rig, frame.images, known, side)
+                write_still(capture, shown, work / name)
+                yield f"{name:28} {tracked(work / name, known, people)}"
+
+
+def tracked(folder: Path, known: np.ndarray, people: str) -> str:
+    """Track the still in a folder; return the cells of its people, with true joints (P, J, 3)."""
+    reporter, result = Quiet(), folder.with_suffix(".h5")
+    try:
+        track(open_capture(folder), result, RecordingOptions(people=people), reporter, force=True)
+    except TkError as error:
+        return f"refused: {error}"
+    left_out = [note for note in reporter.notes if "left out" in note]
+    return "; ".join([*map(described, outcomes(result, known)), *left_out])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -103,6 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--every", type=int, default=20, metavar="N", help="frames between two stills, from N / 2 on")
     parser.add_argument("--cameras", help="use these cameras only")
     parser.add_argument("--people", default="auto", help="as for tk track")
+    parser.add_argument("--chairs", action="store_true", help="draw chairs beside the people")
     parser.add_argument("--work", type=Path, help="folder for captures and results [default: temporary]")
     given = parser.parse_args(arguments)
     print("still                        mean silent far joints", flush=True)
@@ -110,7 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         with tempfile.TemporaryDirectory(dir=given.work) as scratch:
             capture = open_capture(path, given.cameras and given.cameras.split(","), masks="none")
             frames = range(min(given.every // 2, capture.frame_count - 1), capture.frame_count, given.every)
-            for line in compare(capture, frames, given.people, Path(scratch)):
+            for line in compare(capture, frames, given.people, given.chairs, Path(scratch)):
                 print(line, flush=True)
 
 
