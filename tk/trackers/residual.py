@@ -6,8 +6,8 @@ own running mean and spread: ``excess = (residual − mean) / spread``.
 
 A baseline learns what is wrong from the first frame as normal. So the residual is also compared with an absolute level,
 that of correct recordings. Its measure is the *displacement* of a view, twice the geometric mean of missing and surplus
-area: a body in the wrong place has both, a torn mask has only missing area, and a second person only surplus area. A
-frame has the geometric mean of its views: a wrong pose is displaced in most of them, furniture hides a person in one.
+area: a body in the wrong place has both, a second person only surplus area. Missing area beyond the surplus area does
+not count: furniture hides a part of the person, or the mask is torn.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ LEAST_SPREAD = 0.028
 # An excess above this in one view, in spreads, is an outlier. The mean over the views counts it as this value, so that
 # a torn mask in one of three or more views makes no frame's residual high.
 OUTLIER = 5.0
-# Displacement, mean over the views: mean in correct recordings, standard deviation of its logarithm (most of it lies
-# between recordings), and the frames that are judged together.
+# Displacement in the mean over the views: mean in correct recordings, standard deviation of its logarithm (most of it
+# lies between recordings), and the frames that are judged together.
 LEVEL, LEVEL_SPREAD, RECENT = 0.083, 0.28, 5
 
 
 def displacements(residual: Float) -> Float:
     """Return (..., V) the displacement of each view, of residuals (..., V, 2), missing and surplus area."""
-    return np.asarray(2.0 * np.sqrt(residual[..., 0] * residual[..., 1]))
+    missing, surplus = residual[..., 0], residual[..., 1]
+    return np.asarray(2.0 * np.sqrt(np.minimum(missing, surplus) * surplus))
 
 
 def displacement(residual: Float) -> Float:
-    """Return (...) the geometric mean of :func:`displacements`, each at least :data:`LEAST_SPREAD`, over the views that
-    see anybody; NaN if none does."""
-    by_view = np.log(np.maximum(displacements(residual), LEAST_SPREAD))
+    """Return (...) the mean of :func:`displacements` over the views that see anybody; NaN if none does."""
+    by_view = displacements(residual)
     seen = np.isfinite(by_view)
     total, count = np.where(seen, by_view, 0.0).sum(axis=-1), np.count_nonzero(seen, axis=-1)
-    return np.where(count > 0, np.exp(total / np.maximum(count, 1)), np.nan)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def variance_factor(residual: Float) -> Float:
