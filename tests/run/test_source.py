@@ -31,6 +31,7 @@ from tk.run import offline
 from tk.run.draft import Draft
 from tk.run.session import estimates, track_task
 from tk.run.task import Choice, Task, TrackOptions
+from tk.trackers.camera_monitor import CameraMonitor
 from tk.trackers.protocol import Estimate, Frame
 from tk.trackers.region import RegionTracker
 
@@ -363,6 +364,12 @@ def test_somebody_who_enters_gets_a_number_and_who_leaves_is_absent(everybody: t
         np.testing.assert_array_equal(result.frames, np.arange(ENTERING))
         joints = np.array([BODY.skeleton.joints(pose) for pose in own])
         assert np.nanmedian(np.linalg.norm(result.joints - joints, axis=2)) < 0.1  # coarse settings
+
+
+def test_cameras_that_were_moved_show_nobody_who_enters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their masks contain pieces of the scene, which make somebody of what one other camera shows."""
+    monkeypatch.setattr(CameraMonitor, "unfit", np.array([False, True, True, True]))
+    assert len(track_entering(tmp_path / "r.h5", stop=9)) == 1
 
 
 def test_somebody_who_enters_later_can_be_chosen(second: tuple[Result, tuple[Subject, ...]]) -> None:

@@ -56,9 +56,11 @@ def motion(length_s: float = 40.0) -> list[Float]:
     return list(common / common.std() + 0.7 * noise / noise.std())
 
 
-def motion_fault(signals: Sequence[Float], offsets: Sequence[float] = (0.0, 0.0, 0.0)) -> dict[int, str]:
+def motion_fault(
+    signals: Sequence[Float], offsets: Sequence[float] = (0.0, 0.0, 0.0), ties: Sequence[Tie] = ()
+) -> dict[int, str]:
     looks = [Look(np.arange(len(one)) / GRID_HZ, np.zeros((2, 2, 2), np.uint8)) for one in signals]
-    return other_speed_or_order(recordings(looks), [(0.0, one) for one in signals], clocks(offsets))
+    return other_speed_or_order(recordings(looks), [(0.0, one) for one in signals], clocks(offsets), ties)
 
 
 def test_right_motion_has_no_fault() -> None:
@@ -90,6 +92,27 @@ def test_chapters_in_another_order_are_named() -> None:
         [one, np.concatenate([two[half:], two[:half]]), three], (0.0, 20.0, 0.0)
     ).items()  # fmt: skip
     assert camera == 1 and "from 20.0 s to 40.0 s fits the others 40.0 s earlier than the rest" in text
+
+
+def test_motion_that_repeats_is_no_fault_where_sounds_fit_in_both_halves() -> None:
+    """A rhythm, as of a board that is held at place after place, fits as well a period later."""
+    one, two, three = motion()
+    half = len(two) // 2
+    two = np.concatenate([two[:half], np.roll(three[half:], 5 * GRID_HZ, axis=0)])
+    sounds = [Tie(0, 1, at, at, 3e-4, "sound") for at in (2.0, 38.0)]
+    for known, fits in ((sounds, True), (sounds[:1], False), ([sounds[0], replace(sounds[1], own_i=33.0)], False)):
+        assert (motion_fault([one, two, three], ties=known) == {}) == fits
+
+
+def test_seconds_in_which_hardly_anything_moves_are_no_fault() -> None:
+    """The end of all recordings is alike, and so is a pause of one camera: two seconds would fit there exactly."""
+    one, two, three = (signal.copy() for signal in motion())
+    pause = np.linspace(-3.0, 3.0, round(2.5 * GRID_HZ))[:, None].repeat(2, axis=1)
+    for signal in (one, two, three):
+        signal[-len(pause) :] = pause
+    half = len(two) // 2
+    two[half : half + len(pause)] = pause
+    assert motion_fault([one, two, three]) == {}
 
 
 def test_right_pictures_have_no_fault(looks: list[Look]) -> None:

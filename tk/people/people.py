@@ -40,7 +40,7 @@ from tk.people.person import Answer, Person, PersonState, no_pose
 from tk.people.share import PixelOwners, assign
 from tk.settings import Settings
 from tk.trackers.camera_monitor import CameraMonitor, spread_over
-from tk.trackers.protocol import Frame, Tracker, sharing
+from tk.trackers.protocol import Frame, Tracker, sharing, without_cameras
 
 _LOG = logging.getLogger(__name__)
 
@@ -280,17 +280,26 @@ class People:
         for k, person in enumerate(self._tracked):
             share = frame if owners is None else owners.share(frame, k, person.lost and not person.absent)
             answers[person.number] = person.step(share)
+        fit = self._fit(frame)
         if owners is None:
             self._unknown.clear()
         else:
             without = np.empty((len(frame.masks), 0, 0, 3), np.uint8)  # images are views into the ring of frames
-            self._unknown.append(replace(owners.unknown(frame), images=without))
+            self._unknown.append(replace(owners.unknown(fit), images=without))
         judge_contacts(self._contacts, self._tracked, answers)
-        answers |= self._look(frame, owners)
+        answers |= self._look(fit, owners)
         for person in self._tracked:
             if person.absent:
                 answers[person.number] = answers[person.number].without_pose(person.tracker)
         return {person.number: answers[person.number] for person in self.written} or self._nobody(frame)
+
+    def _fit(self, frame: Frame) -> Frame:
+        """Return a frame without the cameras whose images are wrong: what a moved camera shows beside people who are
+        tracked is no evidence of somebody else."""
+        unfit = np.zeros(len(frame.masks), np.bool_)
+        for person in self._tracked:
+            unfit |= person.monitor.unfit
+        return without_cameras(frame, unfit)
 
     def _owners(self, frame: Frame, ahead: bool = False) -> PixelOwners:
         """Return the owners of a frame's pixels, in the order of the people who are tracked, by their bodies.

@@ -38,14 +38,19 @@ _BIN_S = 0.25
 SURE = 0.999
 
 
-def other_speed_or_order(recordings: Sequence[Recording], signals: Sequence[Signals], clocks: Clocks) -> dict[int, str]:
+def other_speed_or_order(
+    recordings: Sequence[Recording], signals: Sequence[Signals], clocks: Clocks, ties: Sequence[Tie]
+) -> dict[int, str]:
     """Return why the motion of a camera fits the others at another speed, or in a part at another lag only: the camera
     that contradicts most, if one does. Where cameras are not synchronised, the fault is in one of these.
+
+    A part in which a sound fits the others is where it belongs: rhythms repeat, sounds do not.
 
     Args:
         recordings: the cameras.
         signals: the motion in their images.
         clocks: those of the cameras that are synchronised.
+        ties: those that the methods are certain of.
     """
     found: list[tuple[float, int, str]] = []
     for c in np.flatnonzero(~clocks.connected).tolist() or range(len(recordings)):
@@ -56,7 +61,9 @@ def other_speed_or_order(recordings: Sequence[Recording], signals: Sequence[Sign
         reference, own, own_start, expected = compared
         others = [each.name for k, each in enumerate(recordings) if k != c and clocks.connected[k]]
         whose = "the others" if len(others) > 1 else others[0]
-        probability, speed = _fits({speed: _compare(reference, own, speed) for speed in (1.0, *_SPEEDS)}, expected)
+        least = _least(reference, own, expected)
+        compared_at = {speed: _compare(reference, own, speed, least) for speed in (1.0, *_SPEEDS)}
+        probability, speed = _fits(compared_at, expected)
         if probability < DOUBT and speed != 1.0:
             fps = 1 / recording.interval_s
             how = f"{speed:.3g} times slower" if speed > 1 else f"{1 / speed:.3g} times faster"
@@ -67,7 +74,11 @@ def other_speed_or_order(recordings: Sequence[Recording], signals: Sequence[Sign
             found.append((probability, c, text))
         if expected is None:
             continue
-        for first, last in _parts(recording, own_start, len(own)):
+        heard = _heard(c, clocks, ties)
+        for part in _parts(recording, own_start, len(own)):
+            first, last = _samples(part, own_start, len(own))
+            if last - first <= SHORTEST_S * GRID_HZ or any(part[0] < at < part[1] for at in heard):
+                continue
             probability, lag = _part_fits(reference, own[first:last], expected + first)
             if probability < DOUBT:
                 begin, end = (own_start + at / GRID_HZ for at in (first, last))
@@ -87,14 +98,14 @@ def unchecked_chapters(
         reference, own, own_start, expected = compared
         if expected is None:
             continue
-        heard = [tie.own_i if c == tie.i else tie.own_j for tie in ties if c in (tie.i, tie.j) and tie.kind == "sound"]
+        heard = _heard(c, clocks, ties)
         shared = [_span(recordings[k], clocks, k) for k in np.flatnonzero(clocks.connected).tolist() if k != c]
         unsure = []
         for path, (begin, end) in zip(recording.paths, pairwise([*recording.begins_s, recording.span[1]]), strict=True):
             low, high = clocks.common(c, begin) + recording.interval_s, clocks.common(c, end) - recording.interval_s
             if any(begin < at < end for at in heard) or not any(one < high and other > low for one, other in shared):
                 continue  # a sound confirms it, or no other camera recorded at that time
-            first, last = (int(np.clip(round((at - own_start) * GRID_HZ), 0, len(own))) for at in (begin, end))
+            first, last = _samples((begin, end), own_start, len(own))
             if _part_fits(reference, own[first:last], expected + first)[0] < SURE:
                 unsure.append(path.name)
         if unsure:
@@ -140,11 +151,17 @@ def _mean(signals: Sequence[tuple[float, Float]]) -> tuple[float, Float]:
     return begin, np.asarray(total[:, :-1] / np.maximum(total[:, -1:], 1))
 
 
-def _compare(reference: Float, own: Float, speed: float) -> tuple[NDArray[np.int64], Float]:
-    """Return lags and their significances, of a signal that is played faster by ``speed``; 0 where too little is in
-    common."""
+def _least(reference: Float, own: Float, expected: int | None) -> int:
+    """Return how many samples both signals must have in common at a lag that may be the right one: half of those at the
+    expected lag. Where nothing moves all signals are alike, so a second or two of a start or an end fits anywhere."""
+    shared = 0 if expected is None else min(len(reference), expected + len(own)) - max(0, expected)
+    return max(round(SHORTEST_S * GRID_HZ), shared // 2)
+
+
+def _compare(reference: Float, own: Float, speed: float, least: int) -> tuple[NDArray[np.int64], Float]:
+    """Return lags and their significances, of a signal that is played faster by ``speed``; 0 where fewer samples than
+    ``least`` are in common."""
     count = int(len(own) / speed)
-    least = round(SHORTEST_S * GRID_HZ)
     if min(count, len(reference)) < least:
         return np.zeros(0, np.int64), np.zeros(0)
     if speed != 1.0:
@@ -169,7 +186,7 @@ def _with_others(c: int, signals: Sequence[Signals], clocks: Clocks) -> tuple[Fl
 
 def _part_fits(reference: Float, part: Float, expected: int) -> tuple[float, int]:
     """Return the probability of the expected lag of a part, 0.5 if it is too short, and the most probable lag."""
-    lags, z = _compare(reference, part - part.mean(axis=0), 1.0)
+    lags, z = _compare(reference, part - part.mean(axis=0), 1.0, _least(reference, part, expected))
     if not len(z):
         return 0.5, expected
     return _fits({1.0: (lags, z)}, expected)[0], int(lags[np.argmax(z)])
@@ -196,12 +213,31 @@ def _fits(compared: dict[float, tuple[NDArray[np.int64], Float]], expected: int 
     return float(np.exp(np.maximum(near / common, 0.0) ** 2 / 2 - highest).sum()) / total, best
 
 
-def _parts(recording: Recording, own_start: float, count: int) -> list[tuple[int, int]]:
-    """Return the samples of parts of a recording: its chapters, or its halves."""
-    begins = [round((begin - own_start) * GRID_HZ) for begin in recording.begins_s[1:]]
-    borders = [begin for begin in begins if 0 < begin < count] or [count // 2]
-    ends = [0, *borders, count]
-    return [(a, b) for a, b in pairwise(ends) if b - a > SHORTEST_S * GRID_HZ]
+def _parts(recording: Recording, own_start: float, count: int) -> list[tuple[float, float]]:
+    """Return the own times, seconds, at which parts of a recording begin and end: its chapters, or two parts that meet
+    in the middle of the ``count`` samples if no chapter begins in these."""
+    own_end = own_start + count / GRID_HZ
+    edges = [*recording.begins_s, recording.span[1]]
+    if not any(own_start < edge < own_end for edge in edges[1:-1]):
+        edges = sorted([*edges, (own_start + own_end) / 2])
+    return list(pairwise(edges))
+
+
+def _samples(part: tuple[float, float], own_start: float, count: int) -> tuple[int, int]:
+    """Return the first of ``count`` samples that is in a part of a recording, own times, and the first after it."""
+    first, last = (int(np.clip(round((at - own_start) * GRID_HZ), 0, count)) for at in part)
+    return first, last
+
+
+def _heard(c: int, clocks: Clocks, ties: Sequence[Tie]) -> list[float]:
+    """Return the own times of a camera at which a sound fits another camera, by the clocks of both."""
+    return [
+        tie.own_i if c == tie.i else tie.own_j
+        for tie in ties
+        if tie.kind == "sound"
+        and c in (tie.i, tie.j)
+        and abs(clocks.common(tie.i, tie.own_i) - clocks.common(tie.j, tie.own_j)) < NEAR_S
+    ]
 
 
 def still_parts(recordings: Sequence[Recording], looks: Sequence[Look], clocks: Clocks) -> list[str]:

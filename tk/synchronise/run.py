@@ -124,7 +124,7 @@ def synchronise(
     clocks = decision.clocks
     if not clocks.connected[1:].any():  # the first camera may be the wrong one: the others are compared
         clocks = max((solve(count, ties, root) for root in range(count)), key=lambda each: int(each.connected.sum()))
-    faulty = other_speed_or_order(recordings, signals, clocks) | faulty
+    faulty = other_speed_or_order(recordings, signals, clocks, ties) | faulty
     if cameras and not faulty and (places := exchanged(recordings, looks, cameras, decision.clocks)):
         right, (a, b) = places
         if right < 1 - SURE:
