@@ -50,7 +50,7 @@ _SHAPES = {"hand_": _END, "foot_": _END, "head": _HEAD}
 
 # Step of a parameter for its derivative, the root of float64's precision: curvature and rounding then change the
 # derivative by less than 1e-6.
-_STEP = 1e-8
+_STEP = float(np.sqrt(np.finfo(np.float64).eps))
 
 
 class BodyFamily:
