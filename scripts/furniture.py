@@ -20,9 +20,7 @@ SIDES = 4  # of a person, at which a chair may stand
 FIRST_RAD = 0.4  # direction of the first side
 # Bones, and how thick a person is about them, metres.
 TRUNK = (*((hip, shoulder) for hip, shoulder in product(HIPS, SHOULDERS)), ("neck", "head_top"))
-BONES = [(*bone, 0.25) for bone in TRUNK] + [
-    (*bone, 0.14) for limb in LIMBS.values() for bone in pairwise(limb)
-]
+BONES = [(*bone, 0.25) for bone in TRUNK] + [(*bone, 0.14) for limb in LIMBS.values() for bone in pairwise(limb)]
 
 
 def with_chairs(rig: Rig, images: NDArray[np.uint8], people: Float, side: int) -> NDArray[np.uint8]:

@@ -21,6 +21,7 @@ from tk.io.results.codec import decode, encode
 from tk.io.results.reader import read_joints
 from tk.io.results.status import Status
 from tk.model.body.joint_sigma import CHANGING_M
+from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import LEAST_INFORMATION, depth_information
 from tk.model.masks.mask_agreement import Agreement
 from tk.model.setup import Subject
@@ -160,6 +161,21 @@ def test_landmarks_confirm_a_camera_whose_masks_contradict_the_others(scene: Sce
             landmarks[:, 0] = np.nan
         frames.append(replace(frame, landmarks=None if seen == "none" else landmarks))
     assert (1 in opening_agreement(scene.setup, frames, np.zeros((3, 4), np.bool_)).wrong) == wrong
+
+
+@pytest.mark.parametrize(("by", "refused"), [(0.0, False), (3.0, True)])
+def test_landmarks_of_two_cameras_do_not_deny_that_one_is_turned(scene: Scene, by: float, refused: bool) -> None:
+    """Their lines of sight nearly meet however a camera is turned about its upright axis; the sizes differ by 2 %."""
+    first, second = tuple(scene.setup.rig)[:2]
+    turn = np.asarray(cv2.Rodrigues(np.radians([0.0, by, 0.0]))[0])
+    turned = replace(second, rotation=turn @ second.rotation, translation=turn @ second.translation)
+    setup = replace(scene.setup, rig=Rig((first, turned)))
+    frames = [
+        replace(frame, masks=frame.masks[:2], landmarks=landmarks_of(scene.setup.rig, BODY, walk(1)[0], 0.02)[None, :2])
+        for frame in scene.frames[:3]
+    ]
+    found = opening_agreement(setup, frames, np.zeros((3, 2), np.bool_))
+    assert bool(found.refusal) == refused
 
 
 def test_two_cameras_that_face_each_other_contradict_no_third(scene: Scene) -> None:

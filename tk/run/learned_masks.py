@@ -7,8 +7,8 @@ scene is unknown, the segmenter's masks before and after the frame decide; where
 asked frames are also a check: around one in which the segmentation disagrees, the segmenter makes all masks between the
 asked frames before and after it.
 
-The first pose needs the masks of the opening. Their scene is learned from the first six asked frames only, so that they
-need not wait for the others of the span.
+The first pose needs the masks of the opening. Their scene is learned from the first eight asked frames only, so that
+they need not wait for the others of the span.
 
 The masks of a frame depend on the recording alone, so `--resume` and `--frames` see the same masks. In a source of
 unknown length the scene is learned from the frames asked for so far; until they are enough, the segmenter makes all
@@ -48,11 +48,8 @@ _Asked: TypeAlias = "tuple[int, Segmented]"
 LEARNED, LEARNED_AND_SEGMENTER, SEGMENTER = range(3)
 MASK_SOURCES = ("learned scene", "learned scene and segmenter", "segmenter")
 
-# Seconds of a span, between asked frames, and least number of asked frames of a span.
+# Seconds of a span, between asked frames, and least number of asked frames of a span; the opening waits for so many.
 _SPAN_S, _STEP_S, _LEAST = 10.0, 0.5, 8
-# Asked frames that the opening waits for; each takes a third of a second. With five, somebody who hardly moves at
-# first is 0.07 cm worse than with eight (docs/experiments.md).
-_FIRST = 6
 # Asked frames that a source of unknown length is learned from, and how many come between two times of learning.
 _PAST, _EVERY = 16, 4
 # At most this share of the frames is asked for; a span with fewer than _LEAST such frames is segmented throughout.
@@ -169,8 +166,8 @@ class LearnedMasks:
         edges = _edges(self._source.first_frame, self._source.frame_count, self._fps)
         parts = [_Part(begin, stop, self._chosen(begin, stop)) for begin, stop in pairwise(edges)]
         first = parts[0] if parts else _Part(0, 0, ())
-        if len(first.samples) > _FIRST and (end := first.begin + opening) < first.stop:
-            parts[:1] = [_Part(first.begin, end, first.samples[:_FIRST]), _Part(end, first.stop, first.samples)]
+        if len(first.samples) > _LEAST and (end := first.begin + opening) < first.stop:
+            parts[:1] = [_Part(first.begin, end, first.samples[:_LEAST]), _Part(end, first.stop, first.samples)]
         return parts
 
     def _span_of(self, index: int) -> _Span:

@@ -24,10 +24,11 @@ from tk.model.body.plausibility import check_extent, check_stature
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import determine_depth
 from tk.model.cameras.landmark_agreement import evidence_for_cameras
+from tk.model.cues.landmarks import deviation
 from tk.model.cues.ray_costs import residual_of
 from tk.model.masks.image_health import MOVED, HealthState, ImageHealth, described
 from tk.model.masks.mask_agreement import Agreement, MaskAgreement
-from tk.model.setup import Setup, Subject
+from tk.model.setup import AVERAGE_STATURE_M, Setup, Subject
 from tk.model.stateful import Stateful
 from tk.trackers.judgement import (
     FAULTS,
@@ -80,7 +81,8 @@ def confirmed(found: Agreement, rig: Rig, landmarks: Sequence[Float | None], bad
     """Return the agreement of masks without contradictions that the landmarks deny.
 
     A network's masks have holes and contain pieces of other things. A camera whose masks contradict the others is right
-    if its landmarks agree with the others'.
+    if its landmarks agree with the others'. Of two cameras, lines of sight nearly meet however one of them is turned
+    about its upright axis: their landmarks deny no contradiction that is small beside the landmarks' own errors.
 
     Args:
         found: by the masks.
@@ -93,7 +95,11 @@ def confirmed(found: Agreement, rig: Rig, landmarks: Sequence[Float | None], bad
         for marked, wrong in zip(landmarks, bad, strict=True)
         if marked is not None
     ]
-    return found.confirmed(evidence_for_cameras(rig, seen)) if seen and (found.wrong or found.refusal) else found
+    apart = np.nanmax(found.tangency.apart, initial=0.0)  # share of the person's size
+    unseen = len(rig) == 2 and apart * AVERAGE_STATURE_M < 2 * deviation(1.0)
+    if not seen or unseen or not (found.wrong or found.refusal):
+        return found
+    return found.confirmed(evidence_for_cameras(rig, seen))
 
 
 @dataclass(frozen=True)
