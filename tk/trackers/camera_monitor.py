@@ -96,7 +96,7 @@ def confirmed(found: Agreement, rig: Rig, landmarks: Sequence[Float | None], bad
         if marked is not None
     ]
     apart = np.nanmax(found.tangency.apart, initial=0.0)  # share of the person's size
-    unseen = len(rig) == 2 and apart * AVERAGE_STATURE_M < 2 * deviation(1.0)
+    unseen = len(rig) == 2 and apart * AVERAGE_STATURE_M < 2 * deviation(np.array(1.0))
     if not seen or unseen or not (found.wrong or found.refusal):
         return found
     return found.confirmed(evidence_for_cameras(rig, seen))
