@@ -191,9 +191,10 @@ PLAIN = SearchSettings(tangential=0.0, robust_px=0.0)
 
 def rows_at(pose, edgels):
     linear, rows = FAMILY.linearised(FAMILY.mean, pose[None]), np.zeros((len(edgels.part), len(pose)))
-    order = np.argsort(edgels.part, kind="stable")
-    for part in linear.rows(edgels.of(order), linear.points(edgels.of(order))):
-        rows[order[part.edgels, None], part.dofs] = part.by_pose
+    for part in np.unique(edgels.part):
+        own = np.flatnonzero(edgels.part == part)
+        dofs, by_dof = linear.pose_rows(part, edgels.of(own), linear.points(edgels.of(own)))
+        rows[own[:, None], dofs] = by_dof
     return rows
 
 

@@ -517,19 +517,6 @@ def test_second_pass_finds_legs_that_were_exchanged_in_most_frames() -> None:
     assert before[:4].mean() > 0.15 and off.max() < 0.06 and np.isfinite(sigma).all()
 
 
-def test_poses_do_not_depend_on_the_memory_for_masks(monkeypatch: pytest.MonkeyPatch) -> None:
-    tracker, lost = tracker_at(POSES[0]), np.arange(6) == 2
-
-    def solved() -> np.ndarray:
-        found = tracker.second_pass(MASKS, POSES + 0.01, lost, np.zeros((6, 3, 2)), None, keep_body=True)
-        return SKELETON.joints(found[0])
-
-    whole = solved()
-    monkeypatch.setattr(second_pass, "AT_ONCE", 2)
-    monkeypatch.setattr(second_pass, "_UNPACKED_BYTES", 1)
-    np.testing.assert_allclose(solved(), whole, atol=1e-6)
-
-
 def test_a_long_recording_is_solved_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     tracker = tracker_at(POSES[0])
 

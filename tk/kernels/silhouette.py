@@ -478,8 +478,8 @@ def find_edgels(
     :func:`normal_equations`."""
     _, _, samples = _launch(body, seen, poses, settings, None, export=True)
     V, Q = len(seen.cameras), len(body.curves)
-    found = np.flatnonzero(samples[:, :, 0] > 0.0)
-    task, chosen = found // settings.most_samples, samples.reshape(-1, _EXPORT)[found].astype(np.float64)
+    task, index = np.nonzero(samples[:, :, 0])
+    chosen = samples[task, index].astype(np.float64)
     return Edgels(
         pose=(task // (V * Q)).astype(np.int32),
         view=(task // Q % V).astype(np.int32),

@@ -27,24 +27,23 @@ class Equations:
     """Normal equations of B blocks of D unknowns each, in the order of time, and of S shared unknowns; begin at zero.
 
     Attributes:
-        hessian: (B, D, D + S) JᵀWJ of each block's own unknowns (rows) and of all that it has (columns, its own first).
+        hessian: (B, D + S, D + S) JᵀWJ of each block's rows; its own unknowns come first.
         gradient: (B, D + S) JᵀW times the residuals, by which the rows' values should grow: the negative gradient.
-        shared: (S, S) JᵀWJ of the shared unknowns, sum over the blocks.
         coupling: (B - 1, D, D) JᵀWJ of the unknowns of a block (rows) and of the next one (columns); None if nothing
             couples blocks.
         prior_hessian, prior_gradient: (S, S), (S,) the same of the shared unknowns' prior.
     """
 
     def __init__(self, blocks: int, own: int, shared: int) -> None:
-        self.hessian, self.gradient = np.zeros((blocks, own, own + shared)), np.zeros((blocks, own + shared))
-        self.shared = np.zeros((shared, shared))
+        size = own + shared
+        self.hessian, self.gradient = np.zeros((blocks, size, size)), np.zeros((blocks, size))
         self.coupling: Float | None = None
         self.prior_hessian, self.prior_gradient = np.zeros((shared, shared)), np.zeros(shared)
 
     @property
     def own(self) -> int:
         """D, the number of a block's own unknowns."""
-        return self.hessian.shape[1]
+        return self.gradient.shape[1] - len(self.prior_gradient)
 
     def add(
         self,
@@ -58,25 +57,21 @@ class Equations:
 
         Args:
             blocks: (N,) index of each row's block, ascending.
-            columns: (K,) the unknowns (of D + S) that the rows are derivatives by, ascending; the same of all rows.
+            columns: (K,) the unknowns (of D + S) that the rows are derivatives by, each once; the same of all rows.
             rows: (N, K) derivatives.
             weight: (N,) information of each row.
             residual: (N,) by how much each row's value should grow.
         """
-        k = np.searchsorted(columns, self.own)
-        scaled = np.column_stack([residual, rows]) * np.sqrt(weight)[:, None]
-        count = np.bincount(blocks)
-        present = np.flatnonzero(count)
-        count = count[present]
-        block, first = np.repeat([np.arange(len(present)), np.cumsum(count) - count], count, axis=1)
+        root, K = np.sqrt(weight), rows.shape[1]
+        present, first, count = np.unique(blocks, return_index=True, return_counts=True)
         # one product of each block, of as many rows as the largest has
-        padded = np.zeros((len(present), count.max(initial=0), scaled.shape[1]))
-        padded[block, np.arange(len(blocks)) - first] = scaled
-        products = padded[..., : k + 1].swapaxes(1, 2) @ padded
-        self.hessian[present[:, None, None], columns[:k, None], columns] += products[:, 1:, 1:]
-        self.gradient[present[:, None], columns] += products[:, 0, 1:]
-        by_shared = scaled[:, k + 1 :]
-        self.shared[np.ix_(columns[k:] - self.own, columns[k:] - self.own)] += by_shared.T @ by_shared
+        scaled = np.zeros((len(present), count.max(initial=0), K + 1))
+        block, row = np.repeat(np.arange(len(present)), count), np.arange(len(blocks)) - np.repeat(first, count)
+        scaled[block, row, :K] = rows * root[:, None]
+        scaled[block, row, K] = residual * root
+        products = scaled.swapaxes(1, 2) @ scaled
+        self.hessian[present[:, None, None], columns[:, None], columns] += products[:, :K, :K]
+        self.gradient[present[:, None], columns] += products[:, :K, K]
 
     def add_block_prior(self, block: int, precision: Float, difference: Float) -> None:
         """Add a prior on a block: precision (D,) and the difference (D,) from the estimate to the prior's mean."""
@@ -84,13 +79,10 @@ class Equations:
         self.hessian[block, index, index] += precision
         self.gradient[block, index] += precision * difference
 
-    def add_normal(self, blocks: NDArray[np.intp], columns: NDArray[np.intp], hessian: Float, gradient: Float) -> None:
-        """Add normal equations (N, K, K), (N, K) of some unknowns (K,), ascending indices of D + S, to those of N
-        different blocks."""
-        k = np.searchsorted(columns, self.own)
-        self.hessian[blocks[:, None, None], columns[:k, None], columns] += hessian[:, :k]
-        self.gradient[blocks[:, None], columns] += gradient
-        self.shared[np.ix_(columns[k:] - self.own, columns[k:] - self.own)] += hessian[:, k:, k:].sum(axis=0)
+    def add_normal(self, block: int, columns: NDArray[np.intp], hessian: Float, gradient: Float) -> None:
+        """Add normal equations (K, K), (K,) of some unknowns (K,), indices of D + S, to a block's."""
+        self.hessian[block][np.ix_(columns, columns)] += hessian
+        self.gradient[block, columns] += gradient
 
     def couple(self, blocks: NDArray[np.intp], before: Float, after: Float, weight: Float, residual: Float) -> None:
         """Add rows that couple blocks to their next ones.
@@ -111,8 +103,8 @@ class Equations:
 
     def reduced(self, damping: float = 0.0) -> Reduced:
         """Eliminate the blocks. ``damping`` is the share of each diagonal element that is added to it."""
-        D, shared = self.own, self.shared + self.prior_hessian
-        own, across = self.hessian[:, :, :D], self.hessian[:, :, D:]
+        D, shared = self.own, self.hessian[:, self.own :, self.own :].sum(axis=0) + self.prior_hessian
+        own, across = self.hessian[:, :D, :D], self.hessian[:, :D, D:]
         if damping:
             own = own + damping * own * np.eye(D)
         chain = Chain.of(own, self.coupling)

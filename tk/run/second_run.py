@@ -81,11 +81,10 @@ class Run:
     def left_out(self) -> NDArray[np.bool_]:
         """Return (C,) the cameras that show the person and were left out of a part of the frames."""
         rows = np.flatnonzero(~self.lost)
-        unused = np.isnan(self.residual[rows, :, 0])
-        if not unused.any():
-            return np.zeros(self.residual.shape[1], np.bool_)
         shown = np.array([shows_person(self.masks.get(int(frame))) for frame in self.frames[rows]])
-        out = shown & unused
+        if not len(rows):
+            return np.zeros(self.residual.shape[1], np.bool_)
+        out = shown & np.isnan(self.residual[rows, :, 0])
         return np.asarray(out.sum(axis=0) > _LEFT_OUT * shown.sum(axis=0))
 
     def wrong_pixels(self, frames: NDArray[np.int64]) -> Float:

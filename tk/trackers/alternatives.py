@@ -137,14 +137,13 @@ class Choice:
     def _choose(self, alternatives: Sequence[Alternative]) -> None:
         """Track alternatives in both directions, and replace the present poses by the likeliest ones; add the spread
         about these to the variance."""
-        every, begun = np.arange(len(self.poses)), self._begun(alternatives)
+        skeleton, every, begun = self.tracker.body.skeleton, np.arange(len(self.poses)), self._begun(alternatives)
         tracks = [self._track(alternatives, begun, step) for step in (1, -1)]
         states = [(track, k) for track in tracks for k in np.flatnonzero(track.found.any(axis=1))]
         poses = np.stack([self.poses, *(track.poses[k] for track, k in states)])  # (S, K, D)
         cost = np.stack([np.zeros(len(every)), *(track.cost[k] for track, k in states)])
         known = np.stack([np.ones(len(every), np.bool_), *(track.found[k] for track, k in states)])
-        joints = np.zeros((*known.shape, len(JOINTS), 3))
-        joints[known] = self.tracker.body.skeleton.joints(poses[known])
+        joints = np.stack([skeleton.joints(one) for one in poses])
         for n in range(1, len(poses)):
             same = np.linalg.norm(joints[:n] - joints[n], axis=-1).max(axis=-1) <= SAME_POSE_M
             known[n] &= ~(same & known[:n]).any(axis=0)
@@ -300,11 +299,12 @@ class Choice:
         for limb in dict.fromkeys(one.limb for one in alternatives):  # those of a limb are settled together
             own = far & np.array([one.limb is limb for one in alternatives])[:, None]
             if own.any():
-                start, n = starts[own], np.nonzero(own)[1]
-                pyramid = Pyramid.of_all([self._shown(i) for i in frames[n].tolist()], LEVEL)
+                start, shown = starts[own], frames[np.nonzero(own)[1]]
+                pyramid = Pyramid.of_all([self._shown(i) for i in shown.tolist()], LEVEL)
                 prior = tracker.prior(start, ANGLE_DEG)
-                settled = tracker.settle(pyramid, start, (LEVEL,), prior=prior, limb=limb).states
-                result[own] = np.where(skeleton.apart(settled, joints[n])[:, None] > SAME_POSE_M, settled, present[n])
+                result[own] = tracker.settle(pyramid, start, (LEVEL,), prior=prior, limb=limb).states
+        if far.any():
+            result = np.where(skeleton.apart(result, joints)[..., None] > SAME_POSE_M, result, present)
         return result
 
 

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -54,7 +53,7 @@ ROUNDS, WINDOW, OVERLAP = 2, 1000, 30
 # seconds: a person who stands still is seen once, not once a frame. CORRELATED_M was chosen on rendered people
 # (docs/experiments.md, Sigma); STILL_S is assumed.
 CORRELATED_M, STILL_S = 0.2, 1.0
-# Bytes of the masks that stay unpacked: those of 240 frames of four VGA cameras. Each frame's are asked for up to
+# Bytes of the masks that stay unpacked: those of 244 frames of four VGA cameras. Each frame's are asked for up to
 # twenty times, in the order of time, so those of a longer recording are unpacked each time.
 _UNPACKED_BYTES = 300_000_000
 
@@ -92,7 +91,9 @@ class SecondPass:
     ) -> None:
         self.tracker, self._report = tracker, report
         self._measured, self._modes, self._colors = measured, modes, colors
-        self._seen = _Seen(tracker.views, masks, measured, np.isfinite(residual[..., 0]))
+        frame = len(tracker.views.rig) * math.prod(tracker.views.rig.frame_shape)
+        self._kept = max(_UNPACKED_BYTES // frame, AT_ONCE)  # frames
+        self._pyramid = _unpacked(tracker.views, masks, measured, np.isfinite(residual[..., 0]), self._kept)
         self.tracked = np.flatnonzero(~lost)
         self._share = np.ones(len(poses))
         steps, seen = _steps(tracker.body.skeleton.joints(poses[self.tracked])), len(self.tracked)
@@ -122,7 +123,7 @@ class SecondPass:
         chosen = np.union1d(opening, _lowest(tracked, error, FIT_FRAMES - len(opening)))
         stature = height_m or tracker.body.dimensions.barefoot
         deviation = STATURE_DEVIATION if height_m else STATURE
-        seen = [self._seen.frame(i) for i in chosen.tolist()]
+        seen = [self._pyramid(i, 1) for i in chosen]
         fitted = tracker.fit(seen, self.poses[chosen], np.arange(len(chosen)), stature, deviation, tracker.body)
         tracker.take_body(fitted.body)
         if self._few:
@@ -130,19 +131,19 @@ class SecondPass:
 
     def settle(self) -> None:
         """Optimise every frame by itself, near its pose of the first pass."""
-        for frames in _blocks(self.tracked):
+        for frames in _chunks(self.tracked):
             prior = self.tracker.prior(self.poses[frames], ANGLE_DEG)
-            settled = self.tracker.settle(self._seen.together(frames), self.poses[frames], (0,), prior=prior)
+            settled = self.tracker.settle(self._together(frames), self.poses[frames], (0,), prior=prior)
             self.poses[frames] = settled.states
             self._advance(len(frames))
 
     def follow(self) -> None:
         """Optimise every frame by itself, at the scale :data:`LEVEL`, from its pose of the first pass, which other
         cameras have given; give each its residual. :meth:`settle` optimises at the finest scale."""
-        for frames in _blocks(self.tracked):
-            coarse = Pyramid.of_all([self._seen.coarse(i) for i in frames.tolist()], LEVEL)
+        for frames in _chunks(self.tracked):
+            coarse = Pyramid.of_all([self._pyramid(i, LEVEL + 1) for i in frames], LEVEL)
             self.poses[frames] = self.tracker.settle(coarse, self.poses[frames], (LEVEL,)).states
-            seen = self._seen.together(frames)
+            seen = self._together(frames)
             label = self.tracker.coarse_grid.render(self.tracker.body, self.poses[frames]).label
             self.residual[frames] = self._residual(seen, label)
 
@@ -155,10 +156,9 @@ class SecondPass:
             first = max(begin - OVERLAP, 0)
             frames = self.tracked[first : begin + WINDOW + OVERLAP]
             poses, covariance = self._smoothed(frames, near[frames], motion)
-            for own in _blocks(self.tracked[begin : begin + WINDOW]):
-                rows = np.searchsorted(frames, own)
-                self.poses[own] = poses[rows]
-                self._judge(own, covariance[rows])
+            for rows in _chunks(np.arange(begin - first, min(begin - first + WINDOW, len(frames)))):
+                self.poses[frames[rows]] = poses[rows]
+                self._judge(frames[rows], covariance[rows])
         self._interpolate()
 
     def _smoothed(self, frames: NDArray[np.int64], near: Float, motion: MotionTerm) -> tuple[Float, Float]:
@@ -166,13 +166,12 @@ class SecondPass:
         poses = near.copy()
 
         def linearised(view_m: float) -> Equations:
-            equations = Equations(len(poses), poses.shape[1], 0)
-            for own in _blocks(frames):
-                rows, share = np.searchsorted(frames, own), self._share[own]
+            equations, share = Equations(len(poses), poses.shape[1], 0), self._share[frames]
+            for rows in _chunks(np.arange(len(frames))):
                 prior = self.tracker.prior(near[rows], ANGLE_DEG)
-                hessian, gradient = self.tracker.equations(self._seen.together(own), poses[rows], prior, view_m)
-                equations.hessian[rows] = share[:, None, None] * hessian
-                equations.gradient[rows] = share[:, None] * gradient
+                hessian, gradient = self.tracker.equations(self._together(frames[rows]), poses[rows], prior, view_m)
+                equations.hessian[rows] = share[rows, None, None] * hessian
+                equations.gradient[rows] = share[rows, None] * gradient
             motion.add(equations, poses, frames)
             return equations
 
@@ -184,7 +183,7 @@ class SecondPass:
 
     def _judge(self, frames: NDArray[np.int64], covariance: Float) -> None:
         """Set the residuals and the variances of frames, whose poses have covariances (N, D, D)."""
-        tracker, seen, poses = self.tracker, self._seen.together(frames), self.poses[frames]
+        tracker, seen, poses = self.tracker, self._together(frames), self.poses[frames]
         label = tracker.coarse_grid.render(tracker.body, poses).label
         self.residual[frames] = residual = self._residual(seen, label)
         variance = tracker.variance(poses, covariance, residual)
@@ -205,8 +204,8 @@ class SecondPass:
         frames, said = tracked[rows], np.add.reduceat(share, np.append(0, rows[:-1] + 1))
         choice = Choice(
             self.tracker,
-            lambda k: self._seen.coarse(int(frames[k])),
-            lru_cache(self._seen.kept)(lambda k: self._evidence(int(frames[k]))),
+            lambda k: self._pyramid(frames[k], LEVEL + 1),
+            lru_cache(self._kept)(lambda k: self._evidence(int(frames[k]))),
             frames,
             np.diff(rows) == np.diff(frames),
             self.poses[frames],
@@ -237,56 +236,30 @@ class SecondPass:
         self._done += frames
         self._report(min(self._done / ((5 + ROUNDS) * len(self.tracked)), 1.0))
 
+    def _together(self, frames: NDArray[np.int64]) -> Pyramid:
+        """Return the finest scale of some frames."""
+        return Pyramid.of_all([self._pyramid(i, 1) for i in frames], 0)
+
     def _evidence(self, i: int) -> Evidence:
         """Return the costs of frame i, with the colours that are known."""
-        return self.tracker.kept_evidence(self._seen.frame(i), None if self._colors is None else self._colors[i])
+        return self.tracker.kept_evidence(self._pyramid(i, 1), None if self._colors is None else self._colors[i])
 
 
-class _Seen:
-    """What F frames show by the cameras that are used, (F, C): masks, and what was measured.
+def _unpacked(
+    views: Views, masks: Sequence[NDArray[np.uint8]], measured: Measured, used: NDArray[np.bool_], kept: int
+) -> Callable[[int, int], Pyramid]:
+    """Return a function from a frame and a number of scales to the scales of the frame's masks, and what was measured
+    in it, by the cameras that are used, (F, C). The masks of ``kept`` frames stay unpacked."""
 
-    The masks of ``kept`` frames stay unpacked, in blocks of :data:`AT_ONCE` successive frames: the kernels take a block
-    without a copy.
-    """
+    @lru_cache(kept)
+    def shown(i: int) -> NDArray[np.uint8]:
+        return masks[i] if used[i].all() else np.where(used[i][:, None, None], masks[i], np.uint8(0))
 
-    def __init__(
-        self, views: Views, masks: Sequence[NDArray[np.uint8]], measured: Measured, used: NDArray[np.bool_]
-    ) -> None:
-        self._sizes, self._measured, self._used = views.sizes, measured, used
-        shape = len(views.rig), *views.rig.frame_shape
-        blocks = max(_UNPACKED_BYTES // (AT_ONCE * math.prod(shape)), 1)
-        self.kept = blocks * AT_ONCE
+    @lru_cache(kept)
+    def pyramid(i: int, scales: int) -> Pyramid:
+        return views.pyramid(shown(int(i)), scales, False, in_frames(measured, i, used[i]))
 
-        @lru_cache(blocks)
-        def block(number: int) -> NDArray[np.uint8]:
-            rows = range(len(used))[AT_ONCE * number : AT_ONCE * (number + 1)]
-            shown = np.empty((len(rows), *shape), np.uint8)
-            for one, i in zip(shown, rows, strict=True):
-                one[:] = masks[i]
-            shown[~used[rows.start : rows.stop]] = 0
-            return shown
-
-        @lru_cache(self.kept)
-        def coarse(i: int) -> Pyramid:
-            seen = views.pyramid(block(i // AT_ONCE)[i % AT_ONCE], LEVEL + 1, False, in_frames(measured, i, used[i]))
-            return replace(seen, masks=(np.zeros((0, 0, 0), np.uint8),) * LEVEL + seen.masks[LEVEL:])
-
-        self._block = block
-        #: returns the scale LEVEL of a frame
-        self.coarse = coarse
-
-    def frame(self, i: int) -> Pyramid:
-        """Return the finest scale of a frame: a copy, with which the block is not kept."""
-        shown = self._block(i // AT_ONCE)[i % AT_ONCE].copy()
-        return Pyramid((shown,), (self._sizes,), in_frames(self._measured, i, self._used[i]))
-
-    def together(self, frames: NDArray[np.int64]) -> Pyramid:
-        """Return the finest scale of frames of a block, see :func:`_blocks`."""
-        shown, rows = self._block(int(frames[0]) // AT_ONCE), frames % AT_ONCE
-        if len(rows) < len(shown):
-            shown = shown[rows]
-        measured = in_frames(self._measured, frames, self._used[frames])
-        return Pyramid((shown.reshape(-1, *shown.shape[2:]),), (self._sizes,), measured)
+    return pyramid
 
 
 def _steps(joints: Float) -> Float:
@@ -296,9 +269,9 @@ def _steps(joints: Float) -> Float:
     return np.asarray((beside[:-1] + beside[1:]) / 2.0)
 
 
-def _blocks(frames: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Return ascending frames in pieces, each of frames of one block of :class:`_Seen`."""
-    return np.split(frames, np.flatnonzero(np.diff(frames // AT_ONCE)) + 1)
+def _chunks(frames: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Return frames in pieces of at most :data:`AT_ONCE`."""
+    return [frames[k : k + AT_ONCE] for k in range(0, len(frames), AT_ONCE)]
 
 
 def _lowest(frames: NDArray[np.int64], error: Float, count: int) -> NDArray[np.int64]:

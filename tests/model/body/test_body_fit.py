@@ -15,7 +15,7 @@ from tk.kernels.silhouette import Edgels
 from tk.model.body import body_fit
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_fit import fit_body
-from tk.model.body.body_parameters import BodyFamily
+from tk.model.body.body_parameters import BodyFamily, shape_rows
 from tk.model.body.body_points import LANDMARKS
 from tk.model.body.cone_body import SHAPE_NUMBERS, build_cone_body
 from tk.model.body.gait_poses import standing_pose, walking_pose
@@ -50,7 +50,7 @@ def pyramids_of(body, poses):
 def edgels_all_over(body, count=400):
     """Edgels at random places of all parts with random rows: derivatives hold for any surface point."""
     rng = np.random.default_rng(8)
-    part = np.sort(rng.integers(len(body.parts), size=count))
+    part = rng.integers(len(body.parts), size=count)
     angle, z = rng.uniform(0, 2 * np.pi, count), rng.uniform(-1, 1, count)
     cone = np.array([p.kind == CONE for p in body.parts])[part]
     radius = np.where(cone, 1.0, np.sqrt(1 - z**2))
@@ -71,20 +71,21 @@ def along_rows(body, pose):
     return np.einsum("na,na->n", EDGELS.row, surface_points(body, pose, EDGELS.part, EDGELS.unscaled))
 
 
-def dense(linear, edgels=EDGELS):
-    """(N, D), (N, K) the rows of the edgels by all degrees of freedom and by all parameters."""
-    by_pose, by_parameter = (np.zeros((len(edgels.part), count)) for count in (len(POSE), len(FAMILY.mean)))
-    for part in linear.rows(edgels, linear.points(edgels)):
-        by_pose[part.edgels, part.dofs] = part.by_pose
-        by_parameter[part.edgels, part.parameters] = part.by_parameter
-    return by_pose, by_parameter
+def dense(rows_of, columns, edgels=EDGELS):
+    """(N, columns) the rows of each part's edgels by all unknowns."""
+    result = np.zeros((len(edgels.part), columns))
+    for part in range(len(AVERAGE.parts)):
+        own = np.flatnonzero(edgels.part == part)
+        unknowns, rows = rows_of(part, edgels.of(own))
+        result[own[:, None], unknowns] = rows
+    return result
 
 
 def test_pose_rows_equal_finite_differences():
     linear = FAMILY.linearised(FAMILY.mean, POSE[None])
     expected = surface_points(AVERAGE, POSE, EDGELS.part, EDGELS.unscaled)
     np.testing.assert_allclose(linear.points(EDGELS), expected)
-    rows, _ = dense(linear)
+    rows = dense(lambda part, edgels: linear.pose_rows(part, edgels, linear.points(edgels)), len(POSE))
     for k, step in enumerate(1e-6 * np.eye(len(POSE))):
         expected = (along_rows(AVERAGE, POSE + step) - along_rows(AVERAGE, POSE - step)) / 2e-6
         if AVERAGE.skeleton.is_by_landmarks[k]:
@@ -93,26 +94,44 @@ def test_pose_rows_equal_finite_differences():
         np.testing.assert_allclose(rows[:, k], expected, atol=1e-7, err_msg=AVERAGE.skeleton.names[k])
 
 
-def test_parts_without_edgels_have_no_rows():
-    linear, some = FAMILY.linearised(FAMILY.mean, POSE[None]), EDGELS.of(EDGELS.part == 3)
-    assert [part.part for part in linear.rows(some, linear.points(some))] == [3]
+def test_shape_rows_equal_finite_differences():
+    groups = AVERAGE.shape_groups
+    T = AVERAGE.part_transforms(AVERAGE.skeleton.segment_transforms(POSE))
+
+    def of_part(part, edgels):
+        first = SHAPE_NUMBERS * AVERAGE.group[part]
+        at = np.broadcast_to(T[part], (len(edgels.part), 4, 4))
+        return first + np.arange(SHAPE_NUMBERS), shape_rows(AVERAGE, part, at, edgels)
+
+    rows = dense(of_part, SHAPE_NUMBERS * len(groups))
+    for k in range(len(groups) * SHAPE_NUMBERS):
+        step = np.zeros(len(groups) * SHAPE_NUMBERS)
+        step[k] = 1e-6
+        pair = [AVERAGE.reshaped(change.reshape(-1, SHAPE_NUMBERS)) for change in (step, -step)]
+        expected = (along_rows(pair[0], POSE) - along_rows(pair[1], POSE)) / 2e-6
+        name = f"{groups[k // SHAPE_NUMBERS]} {k % SHAPE_NUMBERS}"
+        np.testing.assert_allclose(rows[:, k], expected, atol=1e-6, err_msg=name)
+        if k % SHAPE_NUMBERS < 2:
+            assert np.abs(expected).max() > 0.01, f"{name}: no edgel moves"
 
 
-def test_parameter_rows_equal_finite_differences():
+def test_part_without_edgels_has_no_rows():
+    unknowns, rows = FAMILY.linearised(FAMILY.mean, POSE[None]).parameter_rows(0, EDGELS.of(slice(0, 0)))
+    assert rows.shape == (0, len(unknowns))
+
+
+def test_dimension_rows_equal_finite_differences():
     mean = FAMILY.mean
     shared = mean + np.random.default_rng(2).normal(0, 0.02, len(mean)) * (FAMILY.deviation > 1e-5)
-    _, rows = dense(FAMILY.linearised(shared, POSE[None]))
-    body = FAMILY.build(shared)
-    for k, step in enumerate(1e-5 * np.eye(len(mean))):
-        if k < len(DIMENSIONS):
-            name, pair = DIMENSIONS[k], [FAMILY.build(shared + sign * step) for sign in (1, -1)]
-        else:  # by a further change of the shape
-            change = step[len(DIMENSIONS) :].reshape(-1, SHAPE_NUMBERS)
-            name, pair = str(np.argwhere(change)), [body.reshaped(sign * change) for sign in (1, -1)]
-        expected = (along_rows(pair[0], POSE) - along_rows(pair[1], POSE)) / 2e-5
-        np.testing.assert_allclose(rows[:, k], expected, atol=1e-6, err_msg=name)
-        if (k - len(DIMENSIONS)) % SHAPE_NUMBERS < 2:
-            assert np.abs(expected).max() > 0.01, f"{name}: no edgel moves"
+    rows = dense(FAMILY.linearised(shared, POSE[None]).parameter_rows, len(mean))
+    change = shared[len(DIMENSIONS) :].reshape(-1, SHAPE_NUMBERS)
+    for k, name in enumerate(DIMENSIONS):
+        pair = []
+        for sign in (1, -1):
+            values = np.exp(shared[: len(DIMENSIONS)] + sign * 1e-5 * np.eye(len(DIMENSIONS))[k])
+            body = build_cone_body(BodyDimensions(*values)).reshaped(change)
+            pair.append(along_rows(body, POSE))
+        np.testing.assert_allclose(rows[:, k], (pair[0] - pair[1]) / 2e-5, atol=1e-6, err_msg=name)
 
 
 def test_landmark_rows_equal_finite_differences():
@@ -129,12 +148,12 @@ def test_landmark_rows_equal_finite_differences():
 def test_rows_use_the_pose_of_their_frame():
     poses = walk(AVERAGE, 2)
     linear = FAMILY.linearised(FAMILY.mean, poses)
-    both = [dense(linear, EDGELS._replace(pose=EDGELS.pose + i)) for i in range(2)]
-    for pose, found in zip(poses, both, strict=True):
-        alone = dense(FAMILY.linearised(FAMILY.mean, pose[None]))
-        for rows, expected in zip(found, alone, strict=True):
-            np.testing.assert_allclose(rows, expected, atol=1e-9)
-    assert all(np.abs(a - b).max() > 0.01 for a, b in zip(*both, strict=True))
+    K = len(FAMILY.mean)
+    both = [dense(linear.parameter_rows, K, EDGELS._replace(pose=EDGELS.pose + i)) for i in range(2)]
+    for pose, rows in zip(poses, both, strict=True):
+        alone = FAMILY.linearised(FAMILY.mean, pose[None])
+        np.testing.assert_allclose(rows, dense(alone.parameter_rows, K), atol=1e-9)
+    assert np.abs(both[0] - both[1]).max() > 0.01
 
 
 @pytest.mark.parametrize("up", ["z", "x"])

@@ -7,11 +7,8 @@ along an occluding contour the surface slides in the image's tangent only.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise, starmap
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,9 +45,9 @@ _END = (*_WIDTHS, 0.1, 0.005, 0.005, 0.02, 0.01)
 _HEAD = (*_WIDTHS, 0.1, 0.005, _FIXED, 0.02, _FIXED)
 _SHAPES = {"hand_": _END, "foot_": _END, "head": _HEAD}
 
-# Step of a parameter for its derivative, the root of float64's precision: curvature and rounding then change the
-# derivative by less than 1e-6.
-_STEP = float(np.sqrt(np.finfo(np.float64).eps))
+# Difference of a dimension's logarithm for its derivative: curvature then changes the derivative by 1e-6, float64's
+# rounding by less.
+_STEP = 1e-6
 
 
 class BodyFamily:
@@ -97,22 +94,18 @@ class BodyFamily:
         return shared[len(DIMENSIONS) :].reshape(len(self.groups), SHAPE_NUMBERS)
 
     def linearised(self, shared: Float, poses: Float) -> LinearisedBody:
-        """Return the body with parameters (K,) at poses (M, D), and its derivatives by pose and parameters.
+        """Return the body with parameters (K,) at poses (M, D), and its derivatives by the dimensions.
 
         A dimension moves a point in its segment's frame, alike at all poses, and it moves the segment.
         """
         body = self.build(shared)
-        s, (_, inside) = body.skeleton, body.frames
-        shape, T = body.reshape(*part_arrays(BodyDimensions.of(np.exp(self._around(shared)[1:]))), self._change(shared))
-        # a part's shape has parameters of its own, so one step of those of all parts shows the change of each
-        steps = np.repeat(_STEP * np.eye(SHAPE_NUMBERS)[:, None], len(self.groups), axis=1)
-        changed = _part_numbers(shape, s.in_world(T)), _part_numbers(*body.reshape(body.shape, inside, steps))
-        by_part = ((np.concatenate(changed) - _part_numbers(body.shape, inside)) / _STEP).transpose(1, 2, 0)
-        place = by_part[:, :12].reshape(len(inside), 3, -1)
-        by_part[:, :12] = (inside[:, :3, :3].swapaxes(-1, -2) @ place).reshape(len(inside), 12, -1)
+        s = body.skeleton
+        others = BodyDimensions.of(np.exp(self._around(shared)[1:]))
+        shape, T = body.reshape(*part_arrays(others), self._change(shared))
+        by_part = (_part_numbers(shape, s.in_world(T)) - _part_numbers(body.shape, body.frames[1])) / _STEP
         moves = self._segment_moves(shared, poses)[1]
         twists = np.concatenate(s.twists(poses), axis=-1).swapaxes(-1, -2)
-        return LinearisedBody(body, s.segment_transforms(poses), twists, by_part, moves)
+        return LinearisedBody(body, s.segment_transforms(poses), twists, by_part.transpose(1, 2, 0), moves)
 
     def landmark_rows(self, shared: Float, poses: Float) -> Float:
         """Return the derivatives (F, L, 3, K) of the points that landmarks mark by the parameters (K,), at poses
@@ -163,17 +156,6 @@ class BodyFamily:
         g += row * np.log(self.average.stature / stature) / self.stature_deviation
 
 
-class PartRows(NamedTuple):
-    """Derivatives of the positions of a part's contours along their normals, pixels, at n edgels."""
-
-    part: int
-    edgels: slice  # where they are among all edgels
-    dofs: NDArray[np.intp]  # (k,) the degrees of freedom that move the part's contours
-    by_pose: Float  # (n, k)
-    parameters: NDArray[np.intp]  # (m,) the parameters of the body that change the part, ascending
-    by_parameter: Float  # (n, m)
-
-
 @dataclass(frozen=True)
 class LinearisedBody:
     """A body at M poses, with derivatives by pose and parameters. Methods take N edgels, which tell their poses."""
@@ -181,10 +163,8 @@ class LinearisedBody:
     body: ConeBody
     T_world_segment: Float  # (M, S, 4, 4) transforms of its segments
     twists: Float  # (M, 6, D) twist (ω, v) of each degree of freedom
-    # (P, 17, 24 + 8) derivatives of `_part_numbers`, with the place along the part's axes, by the dimensions and, to
-    # first order at no change, by what :meth:`ConeBody.reshaped` changes of the part
-    by_part: Float
-    moves: Float  # (M, S, 3, 24) derivatives of the segments' places by the dimensions
+    by_part: Float  # (P, 17, 24) derivatives of `_part_numbers`
+    moves: Float  # (M, S, 3, 24) derivatives of the segments' places
 
     @cached_property
     def _T_world_part(self) -> Float:
@@ -196,39 +176,32 @@ class LinearisedBody:
         local = self.body.local(edgels.part, edgels.unscaled)
         return np.asarray((T[:, :3, :3] @ local[:, :, None])[:, :, 0] + T[:, :3, 3])
 
-    def rows(self, edgels: Edgels, x_world: Float) -> Iterator[PartRows]:
-        """Yield the derivatives at the edgels of each part, which depend on few of the unknowns; parts without edgels
-        have none.
-
-        Args:
-            edgels: N of them, in the order of parts.
-            x_world: (N, 3) their :meth:`points`.
-        """
+    def pose_rows(self, part: int, edgels: Edgels, x_world: Float) -> tuple[NDArray[np.intp], Float]:
+        """Return the degrees of freedom (k,) that move a part's contours, and the derivatives (N, k) by them of the
+        contours' positions along their normals, pixels, at edgels of this part and their points (N, 3)."""
+        skeleton = self.body.skeleton
+        moved = skeleton.ancestors[self.body.frames[0][part]] & ~skeleton.is_by_landmarks
         # n · (ω × x + v) = ω · (x × n) + v · n
         wrench = np.hstack([cross(x_world, edgels.row), edgels.row])
-        numbers, skeleton, segments = self._numbers(edgels), self.body.skeleton, self.body.frames[0]
-        by_dimension = self.by_part[..., : len(DIMENSIONS)]
-        reached = np.asarray(self.moves[:, segments].any(axis=(0, 2)) | by_dimension.any(axis=1))  # (P, 24)
-        own_shape = len(DIMENSIONS) + np.arange(SHAPE_NUMBERS)
-        ends = np.searchsorted(edgels.part, np.arange(len(segments) + 1)).tolist()
-        for part, own in enumerate(starmap(slice, pairwise(ends))):
-            if own.start == own.stop:
-                continue
-            at, segment = edgels.pose[own], segments[part]
-            dofs = np.flatnonzero(skeleton.ancestors[segment] & ~skeleton.is_by_landmarks)
-            by_pose = (wrench[own, None] @ self.twists[:, :, dofs][at])[:, 0]
-            used = np.flatnonzero(reached[part])
-            by_parameter = numbers[own] @ self.by_part[part][:, np.append(used, own_shape)]
-            by_parameter[:, : len(used)] += (edgels.row[own, None] @ self.moves[:, segment][..., used][at])[:, 0]
-            parameters = np.append(used, own_shape + SHAPE_NUMBERS * self.body.group[part])
-            yield PartRows(part, own, dofs, by_pose, parameters, by_parameter)
+        return np.flatnonzero(moved), (wrench[:, None] @ self.twists[:, :, moved][edgels.pose])[:, 0]
 
-    def _numbers(self, edgels: Edgels) -> Float:
-        """Return the derivatives (N, 17) by what :func:`_part_numbers` gives for the edgels' parts."""
-        u, T = edgels.unscaled, self._T_world_part[edgels.pose, edgels.part]
-        n = (edgels.row[:, None] @ T[:, :3, :3])[:, 0]  # the row in the part's frame
+    def parameter_rows(self, part: int, edgels: Edgels) -> tuple[NDArray[np.intp], Float]:
+        """Return the parameters of the body (k,) that change a part, and the derivatives (N, k) by them at edgels of
+        this part."""
+        moves, by_number = self.moves[:, self.body.frames[0][part]], self.by_part[part]
+        used = np.flatnonzero(moves.any(axis=(0, 1)) | by_number.any(axis=0))
+        rows = (edgels.row[:, None] @ moves[..., used][edgels.pose])[:, 0]
+        rows += self._numbers(part, edgels) @ by_number[:, used]
+        shape = shape_rows(self.body, part, self._T_world_part[edgels.pose, part], edgels)
+        own = len(DIMENSIONS) + SHAPE_NUMBERS * self.body.group[part] + np.arange(SHAPE_NUMBERS)
+        return np.concatenate([used, own]), np.hstack([rows, shape])
+
+    def _numbers(self, part: int, edgels: Edgels) -> Float:
+        """Return the derivatives (N, 17) by what :func:`_part_numbers` gives for a part, at edgels of this part."""
+        u, segments, inside = edgels.unscaled, *self.body.frames
+        n = (edgels.row[:, None] @ self.T_world_segment[edgels.pose, segments[part], :3, :3])[:, 0]
         local = np.column_stack([self.body.local(edgels.part, u), np.ones(len(u))])
-        a, b, h = (n * u).T
+        a, b, h = (n @ inside[part, :3, :3] * u).T
         place = (n[:, :, None] * local[:, None, :]).reshape(-1, 12)
         return np.column_stack([place, a, a * u[:, 2], b, b * u[:, 2], h])
 
@@ -242,6 +215,33 @@ def _part_numbers(shape: Float, T_segment_part: Float) -> Float:
     a, b, h, m = np.moveaxis(shape, -1, 0)
     place = T_segment_part[..., :3, :].reshape(*shape.shape[:-1], 12)
     return np.concatenate([place, np.stack([a, a * (m - 1), b, b * (m - 1), h], axis=-1)], axis=-1)
+
+
+def shape_rows(body: ConeBody, part: int, T_world_part: Float, edgels: Edgels) -> Float:
+    """Return (N, 8) derivatives by the changes of :meth:`ConeBody.reshaped` at no change, to first order, of a part's
+    contours at edgels of this part.
+
+    An axis whose ends move apart tilts, and the cross-sections tilt with it. ``T_world_part`` (N, 4, 4) is the part's
+    place at each edgel's pose.
+    """
+    u, (a, b, h, m) = edgels.unscaled, body.shape[part]
+    n = (edgels.row[:, None, :] @ T_world_part[:, :3, :3])[:, 0]  # the row in the part's frame
+    local = body.local(edgels.part, u)
+    cone = body.is_cone[part]
+    along = u[:, 2] if cone else 0.5 * (u[:, 2] + 1)  # 0 at the beginning of the axis, 1 at its end
+    length = h if cone else 2 * h
+    grown = m * u[:, 2] if cone else np.zeros(len(u))  # derivative of the radius factor by log m
+    rows = np.zeros((len(u), SHAPE_NUMBERS))
+    rows[:, 0] = n[:, 0] * local[:, 0]
+    rows[:, 1] = n[:, 1] * local[:, 1]
+    rows[:, 2] = grown * (n[:, 0] * a * u[:, 0] + n[:, 1] * b * u[:, 1])
+    rows[:, 3] = n[:, 2] * local[:, 2]
+    for axis in range(2):
+        side = body.mirror[part] if axis == 1 else 1.0
+        tilt = n[:, 2] * local[:, axis] / length
+        rows[:, 4 + axis] = side * ((1 - along) * n[:, axis] + tilt)
+        rows[:, 6 + axis] = side * (along * n[:, axis] - tilt)
+    return rows
 
 
 def shapes_of(body: ConeBody) -> Float:

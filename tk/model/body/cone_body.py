@@ -181,26 +181,25 @@ class ConeBody:
         )
 
     def reshape(self, shape: Float, T: Float, change: Float) -> tuple[Float, Float]:
-        """Return shapes (..., P, 4) and frames (..., P, 4, 4) of parts of these names after a change (..., G, 8), see
+        """Return shapes (..., P, 4) and frames (..., P, 4, 4) of parts of these names after a change, see
         :meth:`reshaped`."""
-        rows, cone, side = change[..., self.group, :], self.is_cone, self.mirror
+        rows, cone, side = change[self.group], self.is_cone, self.mirror
         h = shape[..., 2]
         # both ends of the axis in the part's frame, then in the body's
-        x0, y0, x1, y1 = np.moveaxis(rows[..., 4:], -1, 0)
-        ends = ((x0, side * y0, np.where(cone, 0.0, -h)), (x1, side * y1, h))
+        ends = ((rows[:, 4], side * rows[:, 5], np.where(cone, 0.0, -h)), (rows[:, 6], side * rows[:, 7], h))
         begin, end = (
             (T[..., :3, :3] @ np.stack(np.broadcast_arrays(*point), axis=-1)[..., None])[..., 0] + T[..., :3, 3]
             for point in ends
         )
+        frames = np.broadcast_to(np.eye(4), T.shape).copy()
         axis = _unit(end - begin)
-        frames = np.broadcast_to(np.eye(4), (*axis.shape[:-1], 4, 4)).copy()
         front = T[..., :3, 0]
         frames[..., :3, 0] = _unit(front - (front * axis).sum(axis=-1, keepdims=True) * axis)
         frames[..., :3, 1] = cross(axis, frames[..., :3, 0])
         frames[..., :3, 2] = axis
         frames[..., :3, 3] = np.where(cone[:, None], begin, 0.5 * (begin + end))
-        growth = np.exp(rows[..., [0, 1, 3, 2]])
-        growth[..., ~cone, 3] = 1.0
+        growth = np.exp(rows[:, [0, 1, 3, 2]])
+        growth[~cone, 3] = 1.0
         return shape * growth, frames
 
     def part_transforms(self, T_world_segment: Float) -> Float:

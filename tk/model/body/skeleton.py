@@ -123,16 +123,12 @@ class Skeleton:
 
     @cached_property
     def _generators(self) -> tuple[Float, Float]:
-        """(D, 4, 4) the matrices of the twists in the zero configuration, by whose sine, or way of a translation, a
-        point moves, and (D, 4, 4) those by one minus the cosine."""
-        first = np.zeros((len(self.names), 4, 4))
-        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            first[:, i, j], first[:, i, k] = -self.axis[:, k], self.axis[:, j]
-        first[:, :3, 3] = -cross(self.axis, self.point)
-        second = first @ first
-        first[self.prismatic], second[self.prismatic] = 0.0, 0.0
-        first[self.prismatic, :3, 3] = self.axis[self.prismatic]
-        return first, second
+        """(D, 3, 3) the skew matrices of the axes, zero for translations, and their squares."""
+        K = np.zeros((len(self.names), 3, 3))
+        for k, (x, y, z) in enumerate(self.axis):
+            if not self.prismatic[k]:
+                K[k] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+        return K, K @ K
 
     @cached_property
     def _levels(self) -> tuple[NDArray[np.int64], ...]:
@@ -181,20 +177,26 @@ class Skeleton:
         return {}
 
     def _transforms(self, pose: Float) -> Float:
-        first, second = self._generators
-        way = np.where(self.prismatic, pose, np.sin(pose))
-        steps = np.eye(4) + way[..., None, None] * first + (1 - np.cos(pose))[..., None, None] * second
+        K, squares = self._generators
+        steps = np.zeros((*pose.shape, 4, 4))
+        R = np.eye(3) + np.sin(pose)[..., None, None] * K + (1 - np.cos(pose))[..., None, None] * squares
+        steps[..., :3, :3] = R
+        steps[..., :3, 3] = np.where(
+            self.prismatic[:, None], self.axis * pose[..., None], self.point - (R @ self.point[:, :, None])[..., 0]
+        )
         k = self._raised
         steps[..., :3, 3][..., k, :] += self.rise[k] * arm_elevation(pose[..., k], pose[..., k + 1])[..., None]
+        steps[..., 3, 3] = 1.0
+        result = steps
         # calls take most of the time of few poses, products that of many
         for below, above in self._products[pose.size <= _FEW * pose.shape[-1]]:
-            steps[..., below, :, :] = steps[..., above, :, :] @ steps[..., below, :, :]
-        return steps
+            result[..., below, :, :] = result[..., above, :, :] @ result[..., below, :, :]
+        return result
 
     def segment_moves(self, poses: Float, point: Float, rise: Float) -> Float:
         """Return (M, S, 3, K) derivatives of the segments' places at poses (M, D) by K changes, given as derivatives
         (K, D, 3) of :attr:`point` and :attr:`rise`."""
-        K, squares = (generators[:, :3, :3] for generators in self._generators)
+        K, squares = self._generators
         turn = np.sin(poses)[..., None, None] * K + (1 - np.cos(poses))[..., None, None] * squares  # R - 1
         result = -turn @ np.where(self.prismatic[:, None], 0.0, point).transpose(1, 2, 0)
         for k in self._raised:
@@ -233,7 +235,7 @@ class Skeleton:
 
     def rotation(self, dofs: Iterable[int], poses: Float) -> Float:
         """Return the product (..., 3, 3) of successive rotations about these axes of the zero configuration."""
-        K, squares = (generators[:, :3, :3] for generators in self._generators)
+        K, squares = self._generators
         R = np.eye(3)
         for k in dofs:
             angle = poses[..., k, None, None]
@@ -264,7 +266,7 @@ class Skeleton:
         return np.asarray((T[..., :3] @ place[:, :, None])[..., 0] + T[..., 3])
 
     def apart(self, poses: Float, joints: Float) -> Float:
-        """Return the largest distance (...) of the joints of poses (..., D) from others (..., J, 3), metres."""
+        """Return the largest distance (...) of the joints of poses (..., D) from others (J, 3), metres."""
         return np.asarray(np.linalg.norm(self.joints(poses) - joints, axis=-1).max(axis=-1))
 
     def joint_jacobian(self, poses: Float) -> Float:

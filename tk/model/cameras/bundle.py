@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise, starmap
 
 import cv2
 import numpy as np
@@ -188,21 +189,22 @@ class ContourBundle:
         x = linear.points(edgels)
         by_camera, weight = self._camera_rows(state.rig, x, edgels), self._information * edgels.weight
         velocity = np.array([frame.velocity for frame in self.frames])
-        for part in linear.rows(edgels, x):
-            own, at = part.edgels, contours.frame[part.edgels]
-            rows, columns = [part.by_pose], [part.dofs]
+        ends = np.searchsorted(edgels.part, np.arange(len(segments) + 1)).tolist()
+        for part, own in enumerate(starmap(slice, pairwise(ends))):  # a part depends on few of the unknowns
+            some, at = edgels.of(own), contours.frame[own]
+            dofs, by_pose = linear.pose_rows(part, some, x[own])
+            parameters, by_parameter = linear.parameter_rows(part, some)
+            rows, columns = [by_pose, by_parameter], [dofs, D + self.cameras.stop + parameters]
             if L:
-                rows.append(edgels.row[own])
-                columns.append(P + 3 * segments[part.part] + np.arange(3))
+                rows.append(some.row)
+                columns.append(P + 3 * segments[part] + np.arange(3))
             if self.parameters:
                 if "offset" in self.parameters:
-                    by_delay = (part.by_pose * velocity[at][:, part.dofs]).sum(axis=1)
-                    by_camera[own][np.arange(len(at)), edgels.view[own], -1] = by_delay
+                    by_delay = (by_pose * velocity[at][:, dofs]).sum(axis=1)
+                    by_camera[own][np.arange(len(at)), some.view, -1] = by_delay
                 rows.append(by_camera[own].reshape(len(at), self.cameras.stop))
                 columns.append(D + np.arange(self.cameras.stop))
-            rows.append(part.by_parameter)
-            columns.append(D + self.cameras.stop + part.parameters)
-            found.add(at, np.concatenate(columns), np.hstack(rows), weight[own], edgels.distance[own])
+            found.add(at, np.concatenate(columns), np.hstack(rows), weight[own], some.distance)
         marked = [f for f, frame in enumerate(self.frames) if MARKED in frame.pyramid.measured]
         if marked:
             # a network's depth is too cautious, by an unknown share: it says nothing about the body's lengths
@@ -212,8 +214,9 @@ class ContourBundle:
             by_body = self.family.landmark_rows(state.body, state.poses[marked])
             unknowns = np.concatenate([np.arange(P), np.arange(D + S - K, D + S)])
             # offsets of landmarks are the same in all frames, so that many frames say as much as one
-            hessian, gradient = said.normal_equations(np.concatenate([said.jacobian, by_body], axis=-1))
-            found.add_normal(np.array(marked), unknowns, hessian / len(marked), gradient / len(marked))
+            normal = said.normal_equations(np.concatenate([said.jacobian, by_body], axis=-1))
+            for f, hessian, gradient in zip(marked, *normal, strict=True):
+                found.add_normal(f, unknowns, hessian / len(marked), gradient / len(marked))
         precision = np.full(D, POSE_DEVIATION**-2.0)
         precision[P:] = (self._segment_m or 1.0) ** -2.0
         for f, (frame, pose) in enumerate(zip(self.frames, state.poses, strict=True)):

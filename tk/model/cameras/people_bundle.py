@@ -87,13 +87,12 @@ class PeopleBundle:
         own = [bundle.linearise(state, scale) for bundle, state in zip(self.bundles, states, strict=True)]
         if len(own) == 1:
             return own[0]
-        D = own[0].own
+        D = own[0].gradient.shape[1] - len(self._shared[0])
         whole = Equations(self._blocks[-1].stop, D, self.size)
         for one, rows, shared in zip(own, self._blocks, self._shared, strict=True):
             index = np.r_[:D, D + shared]
-            whole.hessian[rows][:, :, index] = one.hessian
+            whole.hessian[rows][:, index[:, None], index] = one.hessian
             whole.gradient[rows][:, index] = one.gradient
-            whole.shared[np.ix_(shared, shared)] += one.shared
             whole.prior_hessian[np.ix_(shared, shared)] += one.prior_hessian
             whole.prior_gradient[shared] += one.prior_gradient
         whole.prior_hessian[self.cameras, self.cameras] /= len(own)
