@@ -118,6 +118,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for path in given.captures:
         with tempfile.TemporaryDirectory(dir=given.work) as scratch:
             capture = open_capture(path, given.cameras and given.cameras.split(","), masks="none")
+            if given.chairs and capture.setup().up != "z":
+                parser.error(f"{path}: --chairs needs a capture with up = z")
             frames = range(min(given.every // 2, capture.frame_count - 1), capture.frame_count, given.every)
             for line in compare(capture, frames, given.people, given.chairs, Path(scratch)):
                 print(line, flush=True)

@@ -280,7 +280,7 @@ class People:
         for k, person in enumerate(self._tracked):
             share = frame if owners is None else owners.share(frame, k, person.lost and not person.absent)
             answers[person.number] = person.step(share)
-        fit = self._fit(frame)
+        fit = self._without_unfit(frame)
         if owners is None:
             self._unknown.clear()
         else:
@@ -293,7 +293,7 @@ class People:
                 answers[person.number] = answers[person.number].without_pose(person.tracker)
         return {person.number: answers[person.number] for person in self.written} or self._nobody(frame)
 
-    def _fit(self, frame: Frame) -> Frame:
+    def _without_unfit(self, frame: Frame) -> Frame:
         """Return a frame without the cameras whose images are wrong: what a moved camera shows beside people who are
         tracked is no evidence of somebody else."""
         unfit = np.zeros(len(frame.masks), np.bool_)

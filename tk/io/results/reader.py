@@ -259,7 +259,7 @@ class StoredPerson:
                 elif isinstance(item, str) and item not in found:
                     found[item] = file.names(path, attribute) if exists else ()
             if entry.optional == "modes":
-                found["modes"] = (*file.shapes.get(path, ()), 0, 0)[1]
+                found["modes"] = (*file.shapes[path], 1)[1] if exists else 0
             elif entry.optional:
                 found.setdefault(entry.optional, exists)
         try:
