@@ -243,3 +243,23 @@ def test_masks_of_development_captures_agree_with_exact_ones(name):
     for mask, exact in zip(masks, truth, strict=True):
         assert iou(mask, exact) > 0.85
         assert np.mean(mask[exact] > 0) > 0.97
+
+
+def test_a_shadow_that_people_enclose_is_no_person():
+    rng = np.random.default_rng(11)
+    scene = np.clip(rng.normal(110, 14, (2, *SHAPE, 1)) * np.array([0.8, 0.95, 1.1]), 0, 255).astype(np.uint8)
+    clips = [np.stack([expose(scene, rng, noise=1.0)[c, :h, :w] for _ in range(5)]) for c, (w, h) in enumerate(SIZES)]
+    foreground = CollinearityForeground.learn(clips, SHAPE, SIZES)
+    ring, hole = np.zeros(SHAPE, np.uint8), np.zeros(SHAPE, np.uint8)
+    cv2.circle(ring, (70, 50), 34, 1, 14)
+    cv2.circle(hole, (70, 50), 26, 1, cv2.FILLED)
+    hole = (hole > 0) & (ring == 0)
+    shown = np.where(hole[..., None], 0.8 * scene, scene)
+    shown[:, ring > 0] = (40, 40, 200)
+    masks, uncertain = foreground.label(expose(shown.astype(np.uint8), rng, noise=1.0))
+    for mask, unsure in zip(masks, uncertain, strict=True):
+        assert np.mean(mask[ring > 0] > 0) > 0.95
+        assert np.mean(mask[hole] > 0) < 0.15 and np.mean(unsure[hole]) > 0.7
+    shown[:, hole] = np.array([85, 101, 117])  # grey cloth: darker than the scene, and without its structure
+    for mask in foreground.label(expose(shown.astype(np.uint8), rng, noise=1.0))[0]:
+        assert np.mean(mask[hole] > 0) > 0.9

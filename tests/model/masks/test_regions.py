@@ -5,7 +5,7 @@ import pytest
 
 from tk.kernels.background import level_of
 from tk.model.masks.mosaic import Mosaic
-from tk.model.masks.regions import person_parts, without_penumbrae
+from tk.model.masks.regions import person_parts, shadow_evidence, without_penumbrae
 
 SHAPE = (40, 60)
 
@@ -61,3 +61,66 @@ def test_tightened_boxes_hold_the_set_pixels_and_a_margin():
     np.testing.assert_array_equal(tight.boxes, [[7, 2, 9, 5], [0, 0, 0, 0], [0, 0, 0, 0]])
     part = mosaic.part_of(marks, 0, tight.boxes[0])
     assert part.shape == (5, 9) and part.sum() == 3 and part[1, 3:6].all()
+
+
+def evidence(image, scene, where):
+    """`shadow_evidence` of the pixels of a drawing, noise variance 4."""
+    pixels = np.flatnonzero(where)
+    values = (each.ravel()[pixels].astype(np.float32) for each in (image, scene))
+    return shadow_evidence(*values, pixels, SHAPE, np.full(len(pixels), 4.0, np.float32), 0.7, 5)
+
+
+@pytest.mark.parametrize("factor, sure", [(0.5, 0.2), (0.75, 0.9), (1.0, 0.9)])
+def test_a_shadow_shows_the_structure_of_the_scene(factor, sure):
+    rng = np.random.default_rng(1)
+    scene, where = 120 + 8 * rng.standard_normal(SHAPE), boxes((slice(5, 25), slice(8, 40)))
+    found = evidence(factor * scene + 2 * rng.standard_normal(SHAPE), scene, where)
+    assert np.mean(found > 4.6) > sure and np.mean(found > 0) > 0.99
+
+
+@pytest.mark.parametrize("pattern", [0.0, 12.0], ids=["plain", "patterned"])
+def test_cloth_does_not(pattern):
+    rng = np.random.default_rng(2)
+    scene, where = 120 + 8 * rng.standard_normal(SHAPE), boxes((slice(5, 25), slice(8, 40)))
+    found = evidence(100 + np.hypot(pattern, 2) * rng.standard_normal(SHAPE), scene, where)
+    assert found.mean() < -0.5 and np.mean(found > 4.6) < 0.02
+    if not pattern:
+        assert np.mean(found < -4.6) > 0.8
+
+
+def test_a_plain_scene_shows_neither():
+    rng = np.random.default_rng(3)
+    where = boxes((slice(5, 25), slice(8, 40)))
+    found = evidence(100 + 2 * rng.standard_normal(SHAPE), np.full(SHAPE, 120.0), where)
+    assert np.abs(found).max() < 1e-3
+
+
+def test_the_outline_of_a_shadow_is_no_sign_of_cloth():
+    rng = np.random.default_rng(4)
+    scene, where = 120 + 8 * rng.standard_normal(SHAPE), boxes((slice(5, 25), slice(8, 40)))
+    light = np.interp(np.arange(SHAPE[1]), [16, 24], [0.75, 1.0])
+    found = evidence(light * scene + 2 * rng.standard_normal(SHAPE), scene, where)
+    assert np.mean(found < -4.6) < 0.02
+
+
+def test_evidence_is_that_of_squares_summed_one_by_one():
+    rng = np.random.default_rng(5)
+    scene = 120 + 8 * rng.standard_normal(SHAPE)
+    image, where = 0.8 * scene + 5 * rng.standard_normal(SHAPE), rng.random(SHAPE) < 0.7
+    where[0] = where[-1] = where[:, 0] = where[:, -1] = False
+    found = np.zeros(SHAPE)
+    found[where] = evidence(image, scene, where)
+    for y, x in ((10, 10), (20, 33), (30, 50)):
+        shown, expected = [], []
+        for v in range(y - 2, y + 3):
+            for u in range(x - 2, x + 3):
+                for w, t in ((v + 1, u), (v, u + 1)):
+                    if where[v, u] and where[w, t]:
+                        shown.append(image[w, t] - image[v, u])
+                        expected.append(scene[w, t] - scene[v, u])
+        shown, expected = np.array(shown), np.array(expected)
+        factor = np.clip(shown @ expected / (expected @ expected), 0.7, 1.0)
+        least = 2 * 4.0 * len(shown)
+        ratio = (shown @ shown + least) / (np.sum((shown - factor * expected) ** 2) + least)
+        if where[y, x]:
+            assert found[y, x] == pytest.approx(len(shown) / 4 * np.log(ratio), rel=1e-3, abs=1e-3)

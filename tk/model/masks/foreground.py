@@ -47,7 +47,15 @@ from tk.model.masks.background import (
 from tk.model.masks.learned_scene import LearnedScene
 from tk.model.masks.mosaic import Mosaic, doubled
 from tk.model.masks.person_boxes import PersonBoxes
-from tk.model.masks.regions import clean_by_area, closed, enclosed, person_parts, trim_rim, without_penumbrae
+from tk.model.masks.regions import (
+    clean_by_area,
+    closed,
+    enclosed,
+    person_parts,
+    shadow_evidence,
+    trim_rim,
+    without_penumbrae,
+)
 from tk.settings import ForegroundSettings
 from tk.system.machine import cores
 
@@ -90,8 +98,11 @@ _PENUMBRA = 0.2
 # Thick labels with a larger statistic than this, in noise variances, are no edge of a shadow.
 _CORE = 8.0
 
-# A region that may be cloth or shadow is foreground if it touches certain foreground with more than this share of its
-# border: a clear majority, because a shadow between two legs touches them on two sides.
+# Pixels that may be cloth or shadow are decided by the scene's structure where this shows either with a probability of
+# 0.99: logarithm of the odds.
+_SURE = 4.6
+# Another region that may be cloth or shadow is foreground if it touches certain foreground with more than this share of
+# its border: a clear majority, because a shadow between two legs touches them on two sides.
 _ENCLOSURE = 0.6
 # Such a region is also foreground in gaps of the person up to this width, as a share of the image height (10 of 480
 # pixels).
@@ -300,7 +311,7 @@ class CollinearityForeground:
             difference_min=_DIFFERENCE_MIN,
             threshold=self.config.threshold,
         )
-        person, doubt = self._decide(mosaic, prior)
+        person, doubt = self._decide(mosaic, prior, noise)
         self._outline(images, gains, person, mosaic, masks)
         full = mosaic.enlarged(_REDUCTION)
         whole = doubled(doubt)
@@ -327,8 +338,8 @@ class CollinearityForeground:
         deviation = 1.4826 * median(np.abs(brighter - middle[:, None]))  # of a normal distribution
         return np.asarray(middle + _BRIGHT_DEVIATIONS * deviation, np.float32)
 
-    def _decide(self, mosaic: Mosaic, prior: Prior | None) -> tuple[Images, Images]:
-        """Return mosaics of reduced images, 0 or 1: the person, and the uncertain pixels."""
+    def _decide(self, mosaic: Mosaic, prior: Prior | None, noise: NDArray[np.float32]) -> tuple[Images, Images]:
+        """Return mosaics of reduced images, 0 or 1: the person, and the uncertain pixels; ``noise``: (C,) variances."""
         statistic = self._statistic
         difference, collinearity = statistic.difference, statistic.collinearity
         seen = difference > 0
@@ -343,11 +354,30 @@ class CollinearityForeground:
             np.copyto(collinearity, 255, where=unknown & shown)
             np.copyto(seen, shown | possible, where=unknown)
         unsure = seen & ~certain
+        pixels = np.flatnonzero(unsure)
+        evidence = self._shadow_evidence(mosaic, pixels, noise)
+        certain.reshape(-1)[pixels[evidence < -_SURE]] = True
+        unsure.reshape(-1)[pixels[np.abs(evidence) > _SURE]] = False
         foreground = certain | enclosed(unsure, certain, _ENCLOSURE)
         foreground |= unsure & closed(foreground, self._bridge)
         area_min = self._area_min / _REDUCTION**2
         person = person_parts(foreground, collinearity, mosaic.corners[:, 0], _SEED, area_min)
         return person, (seen.view(np.uint8) > person).view(np.uint8)
+
+    def _shadow_evidence(
+        self, mosaic: Mosaic, pixels: NDArray[np.intp], noise: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Return (N,) by how much likelier each pixel of a mosaic, flat indices (N,), is a shadow than cloth, see
+        :func:`~tk.model.masks.regions.shadow_evidence`; ``noise``: (C,) variances."""
+        y, x = np.divmod(pixels, mosaic.shape[1])
+        camera = np.searchsorted(mosaic.corners[:, 0], x, side="right") - 1
+        left, top = (mosaic.boxes[:, :2] - mosaic.corners).T
+        _, height, width, _ = self._small.shape
+        at = (camera * height + y + top[camera]) * width + x + left[camera]
+        weights = np.array(GREY, np.float32) / sum(GREY)
+        image, scene = (of.reshape(-1, 3).take(at, axis=0) @ weights for of in (self._small, self._small_scenes))
+        variance = (noise * (weights**2).sum()).astype(np.float32)[camera]
+        return shadow_evidence(image, scene, pixels, mosaic.shape, variance, self.config.shadow_min, self._bridge)
 
     def _outline(
         self, images: Images, gains: NDArray[np.float32], person: Images, mosaic: Mosaic, masks: Images

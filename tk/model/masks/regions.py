@@ -17,6 +17,7 @@ from tk.kernels.background import STEPS_PER_OCTAVE, level_of
 
 Mask = NDArray[np.bool_]
 Images = NDArray[np.uint8]
+Single = NDArray[np.float32]
 
 SQUARE3 = np.ones((3, 3), np.uint8)
 SQUARE5 = np.ones((5, 5), np.uint8)
@@ -34,6 +35,51 @@ def without_penumbrae(labels: Mask, difference: Images, collinearity: Images, pe
     levels = round(-STEPS_PER_OCTAVE * np.log2(penumbra))
     blurred = cv2.add(collinearity, levels) < cv2.dilate(difference, SQUARE5)
     return np.asarray(labels & (thick | ~blurred))
+
+
+def shadow_evidence(
+    image: Single,
+    scene: Single,
+    pixels: NDArray[np.intp],
+    shape: tuple[int, int],
+    noise: Single,
+    darkest: float,
+    size: int,
+) -> Single:
+    """Return by how much likelier the square around each of some pixels shows the scene in a shadow than cloth, (N,)
+    nats.
+
+    A shadow shows the scene's own structure, darker; cloth does not. So the difference of two neighbouring pixels is
+    that of the scene times the factor of the shadow, or it does not depend on the scene. Each explanation leaves a
+    residual. Its variance is unknown, but at least that of the noise: an outline of the shadow, folds and patterns
+    contradict both. Then the logarithms of the likelihoods differ by half the number of differences times that of the
+    ratio of the variances. The differences along rows and along columns repeat each other, and count half.
+
+    Args:
+        image, scene: (N,) brightness of the pixels, those that may be shadow or cloth.
+        pixels: (N,) their flat indices in an image of this shape, ascending, none in its last row or column.
+        shape: (h, w).
+        noise: (N,) variance of the image's brightness.
+        darkest: least factor of a shadow.
+        size: of the square, pixels, odd.
+    """
+    number = np.full(shape[0] * shape[1], -1, np.int32)
+    number[pixels] = np.arange(len(pixels), dtype=np.int32)
+    sums = np.zeros((4, *shape), np.float32)  # differences; shown², shown times scene, scene²
+    for away in (1, shape[1]):
+        beside = number.take(pixels + away)
+        first = np.flatnonzero(beside >= 0)
+        second = beside[first]
+        shown, expected = image[second] - image[first], scene[second] - scene[first]
+        each = np.ones_like(shown), shown * shown, shown * expected, expected * expected
+        for total, values in zip(sums.reshape(4, -1), each, strict=True):
+            total[pixels[first]] += values
+    squares = (cv2.boxFilter(one, -1, (size, size), normalize=False) for one in sums)
+    count, of_image, common, of_scene = (np.asarray(one).reshape(-1).take(pixels) for one in squares)
+    factor = np.clip(common / np.maximum(of_scene, np.float32(1e-3)), darkest, 1.0)
+    left = np.maximum(of_image - factor * (2.0 * common - factor * of_scene), 0.0)
+    floor = 2.0 * noise * count + np.float32(1e-3)
+    return np.asarray(count / 4 * np.log((of_image + floor) / (left + floor)), np.float32)
 
 
 def enclosed(unsure: Mask, certain: Mask, share: float) -> Mask:
