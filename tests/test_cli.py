@@ -193,7 +193,7 @@ SPOILT: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     "a text for a mask": (
         lambda folder: (folder / "masks/cam2/000000.png").write_text("white"), ["masks/cam2/000000.png"],
     ),
-    "nobody there": (_nobody, ["capture", "nobody could be tracked: the working volume is empty"]),
+    "nobody there": (_nobody, ["capture", "nobody could be tracked: the working volume is empty", "unit"]),
     "nobody in the given pose": (_empty_masks, ["capture", "no mask of frame 0 shows anybody"]),
 }  # fmt: skip
 
