@@ -92,6 +92,14 @@ def test_version(tk: Tk) -> None:
     assert tk("--version").out.strip().endswith(__version__)
 
 
+def test_help_lists_each_command_with_its_purpose(tk: Tk) -> None:
+    """Commands that have moved are not listed; their old names print the new ones."""
+    listed = tk("--help").out.split("Commands:")[1].splitlines()
+    rows = [line.split(maxsplit=1) for line in listed if re.match(r"  \w", line)]
+    assert {"track", "sync"} <= {row[0] for row in rows} and all(len(row) == 2 for row in rows)
+    tk("level", "x").complaint("tk calibrate CAPTURE --level")
+
+
 def test_demo_tracks_and_prints_the_accuracy(
     tk: Tk, tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -185,7 +193,7 @@ SPOILT: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     "a text for a mask": (
         lambda folder: (folder / "masks/cam2/000000.png").write_text("white"), ["masks/cam2/000000.png"],
     ),
-    "nobody there": (_nobody, ["capture", "nobody could be tracked: the working volume is empty"]),
+    "nobody there": (_nobody, ["capture", "nobody could be tracked: the working volume is empty", "unit"]),
     "nobody in the given pose": (_empty_masks, ["capture", "no mask of frame 0 shows anybody"]),
 }  # fmt: skip
 

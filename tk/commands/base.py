@@ -74,7 +74,8 @@ class Commands(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List each command with the whole first sentence of its help; click itself would cut it off."""
-        rows = [(name, command.get_short_help_str(limit=1000)) for name, command in sorted(self.commands.items())]
+        shown = sorted((name, command) for name, command in self.commands.items() if not command.hidden)
+        rows = [(name, command.get_short_help_str(limit=1000)) for name, command in shown]
         with formatter.section("Commands"):
             formatter.write_dl(rows)
 

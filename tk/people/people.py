@@ -165,7 +165,10 @@ class People:
                 _LOG.info("waiting: nobody stands in the working volume in frame %d", frame.index)
             if found or not self.refusal:
                 at = f", but somebody stands outside it, at {found[0].where}" if found else ""
-                self.refusal = f"the working volume is empty{at}; check the masks, and [volume] in capture.toml"
+                self.refusal = (
+                    f"the working volume is empty{at}; check the masks, [volume] in capture.toml, and the unit and the "
+                    "image size of calibration.toml"
+                )
             self._refused = 0
             return False
         if frame.index < self._admit_from:

@@ -217,7 +217,7 @@ class ContourFinder:
                     raise CaptureError(
                         f"the height of {stature:.2f} m contradicts the silhouettes, which show a person of about "
                         f"{apparent:.2f} m: correct the height in capture.toml, or omit it; if it is right, "
-                        "calibration.toml has another unit or scale"
+                        "calibration.toml has another unit or scale, or the masks are too large or too small"
                     )
         begun, self._begun = self._begun, None
         if len(frames) == 1 or begun is None or not begun.serves(frames[0], subject):

@@ -24,6 +24,7 @@ from tests.io.conftest import (
 )
 from tk.errors import CalibrationError, CaptureError, VideoError, VolumeError
 from tk.io.captures.capture import FrameReader, open_capture
+from tk.model.cameras.up import up_text
 
 
 def write_masks(folder: Path, cameras: int, frames: int) -> None:
@@ -52,7 +53,8 @@ def test_settings_of_capture_toml_are_used(make_capture: MakeCapture) -> None:
     np.testing.assert_array_equal(capture.up_axis, [0, -1, 0])
     assert capture.rig.names == ("cam1", "cam2", "cam3")
     assert not capture.has_masks and capture.background() is None
-    assert capture.warnings == ()
+    (note,) = capture.warnings  # the cameras are upright along z
+    assert "up = -y" in note
     changed: Any = capture
     with pytest.raises(dataclasses.FrozenInstanceError):
         changed.fps = 1.0
@@ -378,6 +380,14 @@ def test_cameras_on_their_side_leave_the_default_up(make_capture: MakeCapture) -
     assert any(
         "gives no up, and the cameras are mounted differently: z is a guess" in line for line in capture.warnings
     )
+
+
+@pytest.mark.parametrize(("up", "wrong"), [("y", True), ("-z", True), ("z", False), ([0.0, 0.2, 1.0], False)])
+def test_given_up_that_the_cameras_contradict_is_noted(make_capture: MakeCapture, up: Any, wrong: bool) -> None:
+    capture = open_capture(make_capture(cameras=5, settings={"up": up}))
+    assert capture.up == up_text(up)
+    notes = [line for line in capture.warnings if "capture.toml: up = " in line]
+    assert all("upright along z" in line and "--level" in line for line in notes) and len(notes) == wrong
 
 
 # -------------------------------------------------------------------------------------------------- shared captures

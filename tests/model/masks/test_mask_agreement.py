@@ -110,6 +110,17 @@ def test_turned_camera_is_the_only_wrong_one(masks: np.ndarray, camera: int, axi
         assert any(text in found.reason(camera) for text in shown), "with a number of the table"
 
 
+@pytest.mark.parametrize("factor", [0.85, 1.2])
+@pytest.mark.parametrize("camera", range(5))
+def test_camera_with_another_focal_length_is_the_only_wrong_one(masks: np.ndarray, camera: int, factor: float) -> None:
+    """With a longer lens its silhouette is smaller than the others on both sides, and extends beyond none."""
+    matrix = RIG[camera].matrix * [[factor, 1, 1], [1, factor, 1], [1, 1, 1]]
+    rig = Rig(tuple(replace(c, matrix=matrix) if c is RIG[camera] else c for c in RIG))
+    found = compare(masks, rig)
+    assert found.wrong == (camera,) and found.refusal == "" and np.nanargmax(found.pairs_px) == camera
+    assert factor < 1 or "zoomed" in found.reason(camera)
+
+
 def test_camera_that_is_wrong_in_pairs_only_has_their_error(masks: np.ndarray) -> None:
     """The bulky hull of three cameras may have room for the masks of a turned one."""
     cameras = [0, 1, 2, 3]

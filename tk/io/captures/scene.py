@@ -24,18 +24,22 @@ _FAR_APART_M = 100.0
 
 
 def up_of(settings: CaptureSettings, found: FoundUp, path: Path, warn: Callable[[str], None]) -> str:
-    """Return the axis of `capture.toml`; if it gives none, z, unless most cameras are mounted along another one."""
-    if settings.up is not None:
-        return settings.up
-    if not found.sure:
-        warn(f'{path / "capture.toml"}: gives no up, and {found.how}; write up = "{found.up}" if it is right')
+    """Return the axis of `capture.toml`; if it gives none, z, unless most cameras are mounted along another one. A note
+    says if most cameras contradict the given one."""
+    file, given = path / "capture.toml", settings.up
+    if given is None and not found.sure:
+        warn(f'{file}: gives no up, and {found.how}; write up = "{found.up}" if it is right')
         return found.up
-    if up_vector(found.up) @ up_vector(DEFAULT_UP) > np.cos(np.radians(UP_AGREE_DEG)):
-        return DEFAULT_UP
-    warn(
-        f"{path / 'capture.toml'}: gives no up; {shown(found.up)} is taken, {found.how}; "
-        "tk calibrate --level looks closer"
-    )
+    up = DEFAULT_UP if given is None else given
+    if not found.sure or up_vector(found.up) @ up_vector(up) > np.cos(np.radians(UP_AGREE_DEG)):
+        return up
+    if given is not None:
+        warn(
+            f"{file}: up = {shown(given)}, but the cameras are mounted upright along {shown(found.up)}, {found.how}; "
+            "if they are, correct it (tk calibrate --level)"
+        )
+        return given
+    warn(f"{file}: gives no up; {shown(found.up)} is taken, {found.how}; tk calibrate --level looks closer")
     return found.up
 
 

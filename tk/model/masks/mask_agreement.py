@@ -125,13 +125,13 @@ class Agreement:
         """Return what is wrong with a camera."""
         error = self.tangency.error[camera, self.right]
         error, tolerance = error[np.isfinite(error)], TOLERANCE + 2 * self.tangency.pixel[camera]
-        if self.outside[camera] < INCONSISTENT / 2 and not extends(self.tangency, camera):
+        if self.outside[camera] < INCONSISTENT / 2 and not contradicts(self.tangency, camera):
             return "its masks miss a part of the person"
         off = np.hypot(*self.shift_px[camera])
         if not off > 0 and (error < -tolerance).any():
             off = self.pairs_px[camera]
         if off > 0:
-            return f"off by {off:.0f} px or more: turned, moved, late, or another camera's video"
+            return f"off by {off:.0f} px or more: turned, moved, zoomed, late, or another camera's video"
         return "its masks show something else beside the person, or are wrong"
 
 
@@ -175,8 +175,8 @@ class MaskAgreement:
         error = excess(pairs)
         tested = np.flatnonzero(np.isfinite(error).any(axis=1)).tolist()
         kept = largest_consistent(error)
-        # a silhouette that extends beyond no other is no contradiction: the mask misses a part, or others have a shadow
-        wrong = [c for c in tested if c not in kept and extends(pairs, c)] if kept else []
+        # a silhouette that is smaller on one side is no contradiction: the mask misses a part, or others have a shadow
+        wrong = [c for c in tested if c not in kept and contradicts(pairs, c)] if kept else []
         seen = [self.small(masks) for masks in frames]
         hulls = self.hulls([self.possible(masks) for masks in frames], there)
         views = [(masks, hull) for masks, hull in zip(seen, hulls, strict=True) if hull is not None]
@@ -386,10 +386,12 @@ def excess(pairs: Tangency) -> Float:
     return np.asarray(pairs.apart / (TOLERANCE + pairs.pixel[:, None] + pairs.pixel[None]))
 
 
-def extends(pairs: Tangency, camera: int) -> bool:
-    """Return whether a camera's silhouette extends beyond that of another one."""
-    tolerance = TOLERANCE + pairs.pixel[camera] + pairs.pixel
-    return bool((pairs.error[camera] > tolerance[:, None]).any())
+def contradicts(pairs: Tangency, camera: int) -> bool:
+    """Return whether a camera's silhouette extends beyond that of another one, or is smaller on both sides, as with a
+    lens of another focal length."""
+    tolerance = (TOLERANCE + pairs.pixel[camera] + pairs.pixel)[:, None]
+    error = pairs.error[camera]
+    return bool((error > tolerance).any() or (error < -tolerance).all(axis=1).any())
 
 
 def largest_consistent(error: Float) -> list[int]:
