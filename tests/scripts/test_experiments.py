@@ -112,7 +112,6 @@ def short(tiny: Path) -> Track:
     return common.track(tiny, SHORT, 3)
 
 
-@pytest.mark.slow
 def test_a_capture_is_tracked_by_levenberg_marquardt(tiny: Path, short: Track) -> None:
     with instead_of_smd():
         track = common.track(tiny, SHORT, 3)
