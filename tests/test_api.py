@@ -88,6 +88,6 @@ def test_path_is_tracked_once_and_the_result_is_described_in_three_lines(tiny: P
 def test_notes_are_logged(copy, tmp_path, caplog):
     write_video(copy / "videos" / "cam2.mp4", [picture(1, k, (160, 120)) for k in range(3)])
     config = settings_file.from_toml(QUICK)
-    list(tk.track(tk.open_capture(copy), config=config))
+    next(tk.track(tk.open_capture(copy), config=config))
     (warning,) = [r.getMessage() for r in caplog.records if r.name.startswith("tk") and r.levelname == "WARNING"]
     assert "only the first 3 are used" in warning

@@ -221,13 +221,18 @@ def pose_file(path: Path, document: dict[str, Any]) -> Path:
     return path
 
 
-def test_starts_from_rough_joints(copy: Path, tmp_path: Path) -> None:
+def test_starts_from_rough_joints_and_leaves_out_the_frames_before_them(copy: Path, tmp_path: Path) -> None:
     truth = read_joints(copy / "truth.h5")
     rough = truth.positions[4] + np.random.default_rng(0).normal(0, 0.04, (15, 3))
     joints = {name: rough[k].tolist() for k, name in enumerate(JOINTS) if not name.startswith("elbow")}
     file = pose_file(tmp_path / "pose.toml", {"frame": 4, "joints": joints, "subject": {"height": 1.75}})
     without_first_pose(copy, ("da-vinci", "any"))
-    run(copy, tmp_path / "r.h5", init_pose=file, frames=(0, 9))
+    reporter = Silent()
+    run(copy, tmp_path / "r.h5", init_pose=file, frames=(0, 9), reporter=reporter)
+    assert reporter.frames == [4, 5, 6, 7, 8]
+    assert any("frames before 4 are left out" in note for note in reporter.notes)
+    with pytest.raises(ConfigError, match=r"frames 0:2: the subject is found in frame 4"):
+        run(copy, tmp_path / "other.h5", init_pose=file, frames=(0, 2))
     found = read_result(tmp_path / "r.h5")
     np.testing.assert_array_equal(found.frames, np.arange(4, 9))
     assert found.status[0] == Status.INITIALISED and not (found.status == Status.LOST).any()
@@ -271,16 +276,6 @@ def test_masks_that_never_change_are_refused(tk: Tk, copy: Path, tmp_path: Path)
     slow = tmp_path / "c.toml"  # the person stands still at first
     slow.write_text(QUICK.replace("init_frames = 3", f"init_frames = {FRAMES}"))
     tk("track", copy, "-o", tmp_path / "r.h5", "--config", slow).complaint(str(copy), "the masks never change")
-
-
-def test_frames_before_the_initial_one_are_left_out(copy: Path, tmp_path: Path) -> None:
-    without_first_pose(copy, ("frame = 0", "frame = 3"))
-    reporter = Silent()
-    track(open_capture(copy), tmp_path / "r.h5", CONFIG, reporter, frames=(1, 6))
-    assert reporter.frames == [3, 4, 5]
-    assert any("frames before 3 are left out" in note for note in reporter.notes)
-    with pytest.raises(ConfigError, match=r"frames 0:2: the subject is found in frame 3"):
-        run(copy, tmp_path / "other.h5", frames=(0, 2))
 
 
 def test_requested_frames_are_tracked(tiny: Path) -> None:
