@@ -278,6 +278,12 @@ def test_masks_that_never_change_are_refused(tk: Tk, copy: Path, tmp_path: Path)
     tk("track", copy, "-o", tmp_path / "r.h5", "--config", slow).complaint(str(copy), "the masks never change")
 
 
+def test_the_initial_frame_of_the_capture_must_be_tracked(copy: Path, tmp_path: Path) -> None:
+    without_first_pose(copy, ("frame = 0", "frame = 3"))
+    with pytest.raises(ConfigError, match=r"frames 0:2: the subject is found in frame 3"):
+        run(copy, tmp_path / "r.h5", frames=(0, 2))
+
+
 def test_requested_frames_are_tracked(tiny: Path) -> None:
     capture, notes = open_capture(tiny), list[str]()
     assert choose_frames(capture, (0, None), notes.append) == (0, FRAMES)
