@@ -118,10 +118,17 @@ def pretend(monkeypatch: pytest.MonkeyPatch, *frames: int, **values: Any) -> Non
 def test_result_that_contradicts_its_masks_is_suspect_and_ends_with_exit_code_3(
     tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    returned: list[Estimate] = []
+
+    class Watching(Silent):
+        def advance(self, frame: int, estimate: Any) -> None:
+            returned.append(estimate)
+
     pretend(monkeypatch, 0, 1, 2, 3, residual=np.full((4, 2), 0.3))
-    reporter = Silent()
+    reporter = Watching()
     summary = run(tiny, tmp_path / "r.h5", reporter, frames=(0, 4), causal=True)
     assert (summary.frames, summary.suspect, summary.lost) == (4, 4, 0)
+    assert [estimate.status for estimate in returned] == ["suspect"] * 4
     result = read_result(tmp_path / "r.h5")
     assert (result.status == Status.SUSPECT).all() and result.has_pose.all()
     assert result.sigma is not None and np.isnan(result.sigma).all()
