@@ -18,14 +18,20 @@ from tests.conftest import Tk
 from tk.cli import main
 
 
-def test_result_is_replaced_only_with_force(tk: Tk, quick: Path, tiny: Path, causal: Path, tmp_path: Path) -> None:
+def test_result_is_replaced_only_with_force_and_quiet_json_prints_nothing_but_json(
+    tk: Tk, quick: Path, tiny: Path, causal: Path, tmp_path: Path
+) -> None:
     result = Path(shutil.copy(causal, tmp_path / "r.h5"))
     command = ["track", tiny, "-o", result, "--config", quick, "--frames", ":2", "--causal"]
     before = result.read_bytes()
     tk(*command).complaint(str(result), "exists", "--resume", "--force")
     tk(*command, "--resume", "--force").complaint("force", "resume", "one of them")
     assert result.read_bytes() == before
-    assert tk(*command, "--seed", "4", "--force").code == 0
+    ran = tk(*command, "--seed", "4", "--force", "--quiet", "--json")
+    assert (ran.code, ran.err) == (0, "")
+    found = json.loads(ran.out)
+    assert found["result"] == str(result) and found["frames"] == found["tracked_now"] == 2
+    assert found["seconds"] > 0 and found["frames_per_second"] > 0
     with h5py.File(result, "r") as file:
         assert file.attrs["seed"] == 4
 
@@ -42,8 +48,9 @@ def test_hull_and_point_clouds_are_replaced_only_with_force(tk: Tk, tiny: Path, 
     settings = tmp_path / "s.toml"
     settings.write_text("voxels = 16\nahead = 0\n")
     command = ["reconstruct", tiny, "--config", settings, "--frames", ":2"]
-    first = tk(*command, "-o", tmp_path / "h.h5", "--ply", tmp_path / "ply")
-    assert first.code == 0, first.err
+    first = tk(*command, "-o", tmp_path / "h.h5", "--ply", tmp_path / "ply", "--quiet", "--json")
+    assert (first.code, first.err) == (0, "")
+    assert json.loads(first.out)["frames"] == 2
     tk(*command, "-o", tmp_path / "h.h5").complaint("h.h5", "--force")
     tk(*command, "-o", tmp_path / "i.h5", "--ply", tmp_path / "ply").complaint("000000.ply", "--force")
     assert not (tmp_path / "i.h5").exists()
@@ -65,29 +72,6 @@ def test_exit_code_3_if_most_frames_are_lost(tk: Tk, quick: Path, copy: Path, tm
     assert f"{frames - 2} of {frames} frames are lost or suspect" in ran.messages[-1]
     found = json.loads(ran.out)
     assert (found["frames"], found["lost"], found["interrupted"]) == (frames, frames - 2, False)
-
-
-def test_frames_without_anybody_are_counted_apart(tk: Tk, quick: Path, copy: Path, tmp_path: Path) -> None:
-    for mask in (copy / "masks").glob("*/*.png"):
-        if int(mask.stem) >= 2:  # the person has left
-            cv2.imwrite(str(mask), np.zeros_like(cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE)))
-    ran = tk("track", copy, "-o", tmp_path / "r.h5", "--config", quick, "--causal", "--json", "--frames", ":6")
-    assert ran.code == 0, ran.err
-    found = json.loads(ran.out)
-    assert (found["lost"], found["absent"]) == (0, 4)
-    assert "0 lost, 4 absent" in ran.messages[-1]
-
-
-def test_quiet_json_prints_nothing_but_json(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
-    command = ["--config", quick, "--frames", ":2", "--quiet", "--json"]
-    ran = tk("track", tiny, "-o", tmp_path / "r.h5", *command, "--causal")
-    assert (ran.code, ran.err) == (0, "")
-    found = json.loads(ran.out)
-    assert found["result"] == str(tmp_path / "r.h5") and found["frames"] == found["tracked_now"] == 2
-    assert found["seconds"] > 0 and found["frames_per_second"] > 0
-    hull = tk("reconstruct", tiny, "-o", tmp_path / "h.h5", *command)
-    assert (hull.code, hull.err) == (0, "")
-    assert json.loads(hull.out)["frames"] == 2
 
 
 def commands() -> list[str]:

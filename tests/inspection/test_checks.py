@@ -15,9 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from scripts.synthetic.capture import write_calibration
 from tests.conftest import Tk
-from tests.io.conftest import write_picture, write_video
-from tests.model.figures import draw_silhouettes
-from tests.model.ring import ring_of_cameras, turned
+from tests.io.conftest import write_video
+from tests.model.figures import BODY, draw_silhouettes
+from tests.model.ring import turned
+from tests.walkers import RIG, stroll, write_masks
 from tk.errors import CaptureError
 from tk.inspection.checks import inspect
 from tk.inspection.delays import best_shift
@@ -25,10 +26,7 @@ from tk.inspection.leveling import Leveling, find_up, write_up
 from tk.io.captures.capture import open_capture
 from tk.io.captures.frames import FrameSet
 from tk.io.results.reader import read_joints
-from tk.model.body import gait_poses as gait
-from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_points import LANDMARKS
-from tk.model.body.cone_body import build_cone_body
 from tk.model.body.joints import JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.mounting import FoundUp, infer_up
@@ -156,22 +154,11 @@ def test_camera_that_was_moved_after_its_empty_scene_is_named(tk: Tk, copy: Path
 
 def test_delay_of_a_video_is_found_in_frames(tk: Tk, tmp_path: Path) -> None:
     """The masks are rendered; those of one camera are three frames ahead."""
-    rig, count, late = ring_of_cameras(4, 160, 120), 24, 3
-    body = build_cone_body(BodyDimensions.from_stature(1.75))
-    poses = []
-    for i in range(count + late):
-        pose = gait.walking_pose(body.skeleton, i / 15 % 1)
-        pose[:3] = 0.05 * i - 0.6, 0.0, 0.95
-        poses.append(pose)
-    drawn = draw_silhouettes(body, rig, np.array(poses))
-    for c, camera in enumerate(rig):
-        for i in range(count):
-            write_picture(tmp_path / "images" / camera.name / f"{i:06d}.png", np.zeros((120, 160, 3), np.uint8) + 90)
-            mask = drawn[i + late if c == 2 else i, c]
-            write_picture(tmp_path / "masks" / camera.name / f"{i:06d}.png", mask)
-    write_calibration(rig, tmp_path / "calibration.toml")
-    volume = "[volume]\ncenter = [0.0, 0.0, 1.0]\nsize = [2.6, 2.6, 2.4]\n"
-    (tmp_path / "capture.toml").write_text(f"fps = 15.0\n{volume}")
+    count, late = 24, 3
+    drawn = draw_silhouettes(BODY, RIG, stroll(0.05 * np.arange(count + late) - 0.6, 15))
+    masks = drawn[:count].copy()
+    masks[:, 2] = drawn[late:, 2]
+    write_masks(tmp_path, masks)
     ran = tk("inspect", tmp_path, "--json")
     assert ran.code == 0, ran.err
     assert [c["late_frames"] for c in json.loads(ran.out)["cameras"]] == [0, 0, late, 0]
@@ -238,7 +225,7 @@ def standing(count: int = 8) -> list[np.ndarray]:
 @pytest.mark.parametrize("seed", range(5))
 def test_up_is_estimated_in_a_rotated_world(seed: int) -> None:
     R = Rotation.random(random_state=seed).as_matrix()
-    rig = Rig(tuple(replace(c, rotation=c.rotation @ R.T) for c in ring_of_cameras(4, 160, 120)))
+    rig = Rig(tuple(replace(c, rotation=c.rotation @ R.T) for c in RIG))
     found = find_up(infer_up(rig), "z", [hull @ R.T for hull in standing()])
     assert np.degrees(np.arccos(up_vector(found.up) @ R[:, 2])) < 1.5
     assert abs(found.floor_m) < 0.1
@@ -247,7 +234,7 @@ def test_up_is_estimated_in_a_rotated_world(seed: int) -> None:
 def test_standing_person_overrules_cameras_mounted_sideways() -> None:
     quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()
     cameras = []
-    for c in ring_of_cameras(4, 160, 120):
+    for c in RIG:
         cameras.append(replace(c, rotation=quarter @ c.rotation, translation=quarter @ c.translation))
     found = find_up(infer_up(Rig(tuple(cameras))), "z", standing())
     assert found.up == "z" and found.decided
@@ -307,7 +294,7 @@ def test_broken_capture_toml_is_not_changed(tmp_path: Path) -> None:
     assert (tmp_path / "capture.toml").read_text() == "up = \n"
 
 
-UPRIGHT = infer_up(ring_of_cameras(4, 160, 120))
+UPRIGHT = infer_up(RIG)
 UNSURE = FoundUp("z", "mounted differently", sure=False)
 LYING = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 

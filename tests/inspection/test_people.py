@@ -9,41 +9,21 @@ import cv2
 import numpy as np
 import pytest
 
-from scripts.synthetic.capture import write_calibration
 from tests.conftest import Tk
-from tests.io.conftest import write_picture
-from tests.model.figures import draw_silhouettes
-from tests.model.ring import ring_of_cameras
+from tests.model.figures import BODY, draw_silhouettes
+from tests.walkers import RIG, stroll, write_masks
 from tk.inspection.people import PeopleWatch
 from tk.io.captures.capture import open_capture
-from tk.model.body import gait_poses as gait
-from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.cone_body import build_cone_body
 from tk.people.find import LocatedPerson, PeopleFinder
 from tk.run.segmentation import Labels
 
 FRAMES = 12
-RIG = ring_of_cameras(4, 160, 120)
 
 
 def write_walkers(folder: Path, ways: list[list[tuple[float, float]]]) -> None:
     """Write a capture of people who walk from the first to the last point of their ways."""
-    body = build_cone_body(BodyDimensions.from_stature(1.75))
-    masks = np.zeros((FRAMES, len(RIG), 120, 160), bool)
-    for way in ways:
-        poses = []
-        for i, (x, y) in enumerate(np.linspace(*way, FRAMES)):
-            pose = gait.walking_pose(body.skeleton, i / 15 % 1)
-            pose[:3] = x, y, 0.95
-            poses.append(pose)
-        masks |= draw_silhouettes(body, RIG, np.array(poses)) > 0
-    for c, camera in enumerate(RIG):
-        for i in range(FRAMES):
-            write_picture(folder / "images" / camera.name / f"{i:06d}.png", np.zeros((120, 160, 3), np.uint8) + 90)
-            write_picture(folder / "masks" / camera.name / f"{i:06d}.png", 255 * masks[i, c].astype(np.uint8))
-    write_calibration(RIG, folder / "calibration.toml")
-    volume = "[volume]\ncenter = [0.0, 0.0, 1.0]\nsize = [2.6, 2.6, 2.4]\n"
-    (folder / "capture.toml").write_text(f"fps = 15.0\n{volume}")
+    places = [np.linspace(*way, FRAMES).T for way in ways]
+    write_masks(folder, np.max([draw_silhouettes(BODY, RIG, stroll(x, 15, y)) for x, y in places], axis=0))
 
 
 @pytest.fixture(scope="module")

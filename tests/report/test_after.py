@@ -11,7 +11,7 @@ import av
 import numpy as np
 import pytest
 
-from tests.conftest import QUICK, Silent, Tk, track
+from tests.conftest import QUICK, Tk, track
 from tests.io.result_files import revise_result
 from tk.errors import ExportError
 from tk.io import settings_file
@@ -24,9 +24,18 @@ from tk.render.video import made_here as is_our_video
 from tk.report import after
 from tk.report.after import film_for, write_video_and_report
 from tk.report.page import made_here as is_our_page
+from tk.run.prefetch import Serial
+from tk.run.task import Task
 
 
-def test_track_writes_a_video_and_a_report(tk: Tk, tiny: Path, quick: Path, tmp_path: Path) -> None:
+def refuse(*_: object) -> None:
+    raise AssertionError("decoded a second time")
+
+
+def test_track_writes_a_video_and_a_report(
+    tk: Tk, tiny: Path, quick: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Overlay, "pictures", refuse)
     ran = tk("track", tiny, "-o", tmp_path / "r.h5", "--config", quick, "--frames", "1:3", "--causal", pictures=True)
     assert ran.code == 0
     assert f"wrote {tmp_path / 'r.mp4'}, {tmp_path / 'r.html'}" in ran.err.splitlines()
@@ -40,33 +49,28 @@ def images_of(video: Path) -> np.ndarray:
         return np.array([image.to_ndarray(format="bgr24") for image in container.decode(video=0)], float)
 
 
+AHEAD = settings_file.from_toml(QUICK.replace("ahead = 0", "ahead = 2"))
+
+
+def opened(tiny: Path) -> Capture:
+    """Return the capture at twice the rate of a video, which therefore shows every second frame and lasts as long."""
+    return replace(open_capture(tiny), fps=30.0)
+
+
 @pytest.fixture(scope="module")
 def filmed(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Film]:
-    """A result of frames 1 to 6, and its film. Not to be changed."""
-    result = tmp_path_factory.mktemp("film") / "r.h5"
-    return result, tracked_with_film(open_capture(tiny), result)
-
-
-def tracked_with_film(capture: Capture, result: Path, settings: str = QUICK) -> Film:
-    """Track frames 1 to 6 causally; return the film."""
+    """A result of frames 1 to 6, and its film, of images that another process has decoded. Not to be changed."""
+    result, capture = tmp_path_factory.mktemp("film") / "r.h5", opened(tiny)
     film = film_for(capture, result)
-    track(capture, result, settings_file.from_toml(settings), film=film, frames=(1, 7), causal=True)
-    assert film is not None
-    return film
+    track(capture, result, AHEAD, film=film, frames=(1, 7), causal=True)
+    assert film is not None and list(result.parent.iterdir()) == [result]
+    return result, film
 
 
-def refuse(*_: object) -> None:
-    raise AssertionError("decoded a second time")
-
-
-@pytest.mark.parametrize("ahead", [0, 2])
 def test_a_run_keeps_the_images_that_its_video_and_report_show(
-    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ahead: int
+    tiny: Path, filmed: tuple[Path, Film], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At twice the rate of a video, which therefore shows every second frame and has the same duration."""
-    capture, result = replace(open_capture(tiny), fps=30.0), tmp_path / "r.h5"
-    film = tracked_with_film(capture, result, QUICK.replace("ahead = 0", f"ahead = {ahead}"))
-    assert list(tmp_path.iterdir()) == [result]
+    capture, result, film = opened(tiny), Path(shutil.copy(filmed[0], tmp_path)), filmed[1]
     write_video_and_report(capture, result, pytest.fail)
     decoded, page = images_of(tmp_path / "r.mp4"), (tmp_path / "r.html").read_text(encoding="utf-8")
     monkeypatch.setattr(Overlay, "pictures", refuse)
@@ -81,19 +85,24 @@ def test_a_run_keeps_the_images_that_its_video_and_report_show(
 
 
 def test_a_resumed_run_has_a_whole_video(tiny: Path, filmed: tuple[Path, Film], tmp_path: Path) -> None:
-    capture, result = open_capture(tiny), Path(shutil.copy(filmed[0], tmp_path))
+    capture, result = opened(tiny), Path(shutil.copy(filmed[0], tmp_path))
     film = film_for(capture, result)
-    track(capture, result, settings_file.from_toml(QUICK), film=film, frames=(1, 10), causal=True, resume=True)
+    track(capture, result, AHEAD, film=film, frames=(1, 10), causal=True, resume=True)
     write_video_and_report(capture, result, pytest.fail, film)
-    assert len(images_of(tmp_path / "r.mp4")) == 9
+    assert len(images_of(tmp_path / "r.mp4")) == 5  # frames 1, 3 to 9
 
 
-def test_a_run_on_a_full_disk_has_a_whole_video(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_on_a_full_disk_has_a_whole_video(
+    tiny: Path, filmed: tuple[Path, Film], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
-    capture, result, reporter = open_capture(tiny), tmp_path / "r.h5", Silent()
+    capture, result, notes = opened(tiny), Path(shutil.copy(filmed[0], tmp_path)), list[str]()
     film = film_for(capture, result)
-    track(capture, result, settings_file.from_toml(QUICK), reporter, film=film, frames=(1, 4), causal=True)
-    assert ["decoded twice" in note for note in reporter.notes] == [True]
+    assert film is not None
+    film.frames = range(1, 7, 2)
+    for _ in Serial(Task.of(capture, AHEAD), notes.append, film=film).frames(1, 7):
+        pass
+    assert ["decoded twice" in note for note in notes] == [True]
     write_video_and_report(capture, result, pytest.fail, film)
     assert len(images_of(tmp_path / "r.mp4")) == 3
 
@@ -101,15 +110,14 @@ def test_a_run_on_a_full_disk_has_a_whole_video(tiny: Path, tmp_path: Path, monk
 def test_images_of_other_delays_than_those_that_the_run_has_found_are_decoded(
     tiny: Path, filmed: tuple[Path, Film], tmp_path: Path
 ) -> None:
-    capture, result = open_capture(tiny), Path(shutil.copy(filmed[0], tmp_path))
-    film = filmed[1]
+    capture, result, film = opened(tiny), Path(shutil.copy(filmed[0], tmp_path)), filmed[1]
     late = np.array([0, 0, 1, 0]) / capture.fps
     revise_result(result, cameras=UsedCameras(capture.rig, late))
     overlay = Overlay(capture, read_result(result), after._WIDEST)
     _, pictures = after._pictures(overlay, capture, film)
-    with capture.frames(1, 3) as recorded:
+    with capture.frames(2, 4) as recorded:
         first, second = (frame.images.copy() for frame in recorded)
-    shown = dict(pictures)[2]
+    shown = dict(pictures)[3]
     np.testing.assert_array_equal(shown[2], first[2])
     np.testing.assert_array_equal(shown[1], second[1])
 

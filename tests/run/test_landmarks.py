@@ -11,7 +11,7 @@ import pytest
 
 from tests.conftest import Silent, StopAt
 from tests.model.landmarks import landmarks_of
-from tests.run.test_source import BODY, ONE, POSES, RIG, SETTINGS, SETUP
+from tests.run.test_source import BODY, ONE, POSES, RIG, SETTINGS, SETUP, first_pose
 from tk.io.captures.frames import FrameSet
 from tk.io.results.reader import read_result
 from tk.model.body.body_points import LANDMARKS
@@ -21,6 +21,7 @@ from tk.run.segmentation import Labels
 from tk.run.session import track_task
 from tk.run.task import Task, TrackOptions
 
+POSED = replace(SETUP, subjects=(replace(SETUP.subjects[0], init=first_pose(POSES[0])),))
 ASKED = range(0, len(POSES), 2)  # frames that the network sees
 
 
@@ -50,10 +51,10 @@ def test_result_has_the_landmarks_that_were_seen_and_a_resumed_run_equals_an_uni
     """The second pass goes over frames of both runs."""
     whole, stopped = tmp_path / "whole.h5", tmp_path / "stopped.h5"
     options = TrackOptions(replace(SETTINGS, landmarks="auto"))
-    track_task(Task(SETUP, ONE, options), whole, Silent())
-    assert track_task(Task(SETUP, ONE, options), stopped, StopAt(2)).interrupted
+    track_task(Task(POSED, ONE, options), whole, Silent())
+    assert track_task(Task(POSED, ONE, options), stopped, StopAt(2)).interrupted
     assert REFINED not in read_result(stopped).model
-    assert not track_task(Task(SETUP, ONE, options), stopped, Silent(), resume=True).interrupted
+    assert not track_task(Task(POSED, ONE, options), stopped, Silent(), resume=True).interrupted
     result, found = read_result(whole), read_result(stopped)
     assert result.model[REFINED] == found.model[REFINED] == 1
     assert result.meta.landmark_names == LANDMARKS

@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.conftest import QUICK
 from tests.people import RIG, person_mask, write_people
 from tk.errors import CaptureError
+from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.kernels.mask_values import PERSON
 from tk.model.body.anthropometry import AVERAGE_BODY
@@ -68,7 +70,7 @@ def test_somebody_who_cannot_be_tracked_does_not_end_the_run_of_others(tmp_path:
 def test_somebody_beside_the_volume_is_no_evidence_in_the_first_frame(tmp_path: Path) -> None:
     """Nobody tracks the other person, who stands outside."""
     capture = open_capture(write_people(tmp_path / "two", [lambda _: (-0.6, 0.0)], 1))
-    task = Task(capture.setup(), capture, TrackOptions())
+    task = Task(capture.setup(), capture, TrackOptions(settings_file.from_toml(QUICK)))
     people = People(task.setup, task.settings, "auto", RegionTracker.of(task.setup, task.settings), lambda _: None)
     alone = np.stack([person_mask(camera, (-0.6, 0.0)) for camera in RIG])
     masks = alone | np.stack([person_mask(camera, (1.5, 0.2)) for camera in RIG])

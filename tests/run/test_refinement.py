@@ -16,8 +16,9 @@ import pytest
 
 from tests.conftest import FITTED, QUICK, Silent, Tk, as_if_killed, track
 from tests.inspection.test_checks import turn_camera
-from tests.model.figures import draw_silhouettes
+from tests.model.figures import BODY, draw_silhouettes
 from tests.model.ring import ring_of_cameras
+from tests.walkers import RIG, stroll
 from tk.io import settings_file
 from tk.io.captures.calibration import read_calibration
 from tk.io.captures.capture import Capture, open_capture
@@ -25,9 +26,6 @@ from tk.io.captures.mask_store import MaskStore
 from tk.io.results.reader import read_joints, read_result
 from tk.io.results.status import Status
 from tk.kernels.mask_values import OTHERS
-from tk.model.body import gait_poses as gait
-from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.cone_body import build_cone_body
 from tk.model.cameras.bundle import TrackedPoses
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.refinement import turn_between
@@ -194,45 +192,38 @@ def test_result_without_a_body_and_bad_options_are_refused(tiny: Path, tracked: 
 @pytest.mark.parametrize("away", [range(0), range(10, 14)])
 @pytest.mark.parametrize("late", [[0, 0, 0, 0], [0, 2, 0, 0], [0, 0, -3, 0]])
 def test_videos_that_are_late_by_more_than_edges_reach_are_found(late: list[int], away: range) -> None:
-    rig, body = ring_of_cameras(4, 160, 120), build_cone_body(BodyDimensions.from_stature(1.75))
     frames = np.arange(24)
-    poses = np.array([gait.walking_pose(body.skeleton, i / 12 % 1) for i in frames])
-    poses[:, :3] = np.column_stack([0.08 * frames - 1.0, 0 * frames, 0 * frames + 0.95])
-    drawn = draw_silhouettes(body, rig, poses)  # frame k of a late video shows frame k + late of the others
+    poses = stroll(0.08 * frames - 1.0, 12)
+    drawn = draw_silhouettes(BODY, RIG, poses)  # frame k of a late video shows frame k + late of the others
     drawn[:, 3, ::3] = 0  # this camera's masks are poor
     drawn[away] = 0
     seen = np.array([[drawn[min(max(k + n, 0), 23), c] for c, n in enumerate(late)] for k in frames])
     tracked = TrackedPoses(frames, poses, seen.any(axis=(2, 3)).all(axis=1))
-    found = whole_delays([TrackedPerson(body, seen.__getitem__, tracked)], rig)
+    found = whole_delays([TrackedPerson(BODY, seen.__getitem__, tracked)], RIG)
     assert found.tolist() == late
 
 
 @pytest.mark.parametrize(("count", "found"), [(56, [0, 12, 0, 0]), (24, [0, 0, 0, 0])])
 def test_delay_at_the_edge_of_the_range_is_searched_farther_and_never_taken(count: int, found: list[int]) -> None:
     """A video is twelve frames late. In 24 frames, no delay of that size can be tested."""
-    rig, body = ring_of_cameras(4, 160, 120), build_cone_body(BodyDimensions.from_stature(1.75))
     frames = np.arange(count)
-    poses = np.array([gait.walking_pose(body.skeleton, i / 31 % 1) for i in frames])
-    poses[:, :3] = np.column_stack([0.03 * frames - 0.8, 0 * frames, 0 * frames + 0.95])
-    drawn = draw_silhouettes(body, rig, poses)
+    poses = stroll(0.03 * frames - 0.8, 31)
+    drawn = draw_silhouettes(BODY, RIG, poses)
     seen = np.array([[drawn[min(k + n, count - 1), c] for c, n in enumerate((0, 12, 0, 0))] for k in frames])
     tracked = TrackedPoses(frames, poses, np.ones(count, np.bool_))
-    assert whole_delays([TrackedPerson(body, seen.__getitem__, tracked)], rig).tolist() == found
+    assert whole_delays([TrackedPerson(BODY, seen.__getitem__, tracked)], RIG).tolist() == found
 
 
 def test_an_excluded_camera_is_not_late() -> None:
     """From some frame on it shows the person in few pixels only, and the body covers many times as many others."""
-    rig, body = ring_of_cameras(4, 160, 120), build_cone_body(BodyDimensions.from_stature(1.75))
     frames = np.arange(40)
-    poses = np.array([gait.walking_pose(body.skeleton, i / 12 % 1) for i in frames])
-    poses[:, :3] = np.column_stack([0.03 * frames - 0.6, 0 * frames, 0 * frames + 0.95])
-    seen = draw_silhouettes(body, rig, poses)
+    poses = stroll(0.03 * frames - 0.6, 12)
+    seen = draw_silhouettes(BODY, RIG, poses)
     aside = np.roll(seen[24:, 1], 50, axis=2)  # the camera is turned
     seen[24:, 1] = np.where(aside > 0, OTHERS, 0)
     seen[24:, 1, 50:54, 70:74] = 255
-    found = whole_delays(
-        [TrackedPerson(body, seen.__getitem__, TrackedPoses(frames, poses, np.ones(40, np.bool_)))], rig
-    )
+    tracked = TrackedPoses(frames, poses, np.ones(40, np.bool_))
+    found = whole_delays([TrackedPerson(BODY, seen.__getitem__, tracked)], RIG)
     assert found.tolist() == [0, 0, 0, 0]
 
 
@@ -278,7 +269,7 @@ def judged(
     nobody: Any = None
     draft = Draft(nobody, result, nobody, np.zeros(F, np.bool_), np.zeros(F, np.bool_), columns, refined=True)
     task: Any = SimpleNamespace(settings=Settings())
-    finish._Finisher(task, True, notes.append, lambda _: None, ring_of_cameras(4, 160, 120))._judge(draft)
+    finish._Finisher(task, True, notes.append, lambda _: None, RIG)._judge(draft)
     finish.report_frames(result.frames, draft.current("evidence/reason"), notes.append)
     return draft, notes
 

@@ -162,9 +162,10 @@ def test_only_the_same_command_is_resumed(
 
 
 def test_large_images_are_reduced_and_the_result_has_the_recorded_cameras(
-    tiny: Path, causal: Path, tmp_path: Path
+    copy: Path, causal: Path, tmp_path: Path
 ) -> None:
-    capture, half = open_capture(tiny), tmp_path / "half.h5"
+    """The run is resumed with images of the same size only."""
+    capture, half = open_capture(copy), tmp_path / "half.h5"
     tall = capture.setup().person_pixels()
     config = replace(CONFIG, person_pixels=int(tall.min() / 2))
     reporter = Silent()
@@ -178,15 +179,10 @@ def test_large_images_are_reduced_and_the_result_has_the_recorded_cameras(
         np.testing.assert_allclose(camera.matrix, expected.matrix, rtol=1e-12)
     assert np.median(np.linalg.norm(found.joints - full, axis=2)) < 0.05
     assert np.abs(found.joints - full).max() > 0  # it is another computation
-
-
-def test_resumed_run_must_read_images_at_the_same_size(copy: Path, tmp_path: Path) -> None:
-    config = replace(CONFIG, person_pixels=int(open_capture(copy).setup().person_pixels().min() / 2))
-    run(copy, tmp_path / "r.h5", frames=(0, 1), config=config)
     settings = (copy / "capture.toml").read_text(encoding="utf-8").replace("height = 1.75", "height = 1.2")
     (copy / "capture.toml").write_text(settings, encoding="utf-8")
     with pytest.raises(ResultError, match="size of the images: 1/2, 1/2, 1/2, 1/2, not full, full, full, full"):
-        run(copy, tmp_path / "r.h5", resume=True, config=config)
+        conftest.track(open_capture(copy), half, config, resume=True, causal=True)
 
 
 def test_lost_frames_of_all_runs_are_counted(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -196,8 +192,8 @@ def test_lost_frames_of_all_runs_are_counted(copy: Path, tmp_path: Path, monkeyp
         for index in (3, 4, 5):
             write_picture(camera / f"{index:06d}.png", np.zeros((120, 160), np.uint8))
     result, capture = tmp_path / "r.h5", open_capture(copy)
-    assert track(capture, result, CONFIG, StopAt(4)).lost == 2
-    assert track(capture, result, CONFIG, resume=True).lost == 3
+    assert track(capture, result, CONFIG, StopAt(4), frames=(0, 9)).lost == 2
+    assert track(capture, result, CONFIG, resume=True, frames=(0, 9)).lost == 3
     status = read_result(result).status
     assert list(status[:3]) == [Status.INITIALISED, Status.TRACKED, Status.TRACKED]
     assert list(status[3:7]) == [Status.LOST, Status.LOST, Status.LOST, Status.RECOVERED]
@@ -225,13 +221,18 @@ def pose_file(path: Path, document: dict[str, Any]) -> Path:
     return path
 
 
-def test_starts_from_rough_joints(copy: Path, tmp_path: Path) -> None:
+def test_starts_from_rough_joints_and_leaves_out_the_frames_before_them(copy: Path, tmp_path: Path) -> None:
     truth = read_joints(copy / "truth.h5")
     rough = truth.positions[4] + np.random.default_rng(0).normal(0, 0.04, (15, 3))
     joints = {name: rough[k].tolist() for k, name in enumerate(JOINTS) if not name.startswith("elbow")}
     file = pose_file(tmp_path / "pose.toml", {"frame": 4, "joints": joints, "subject": {"height": 1.75}})
     without_first_pose(copy, ("da-vinci", "any"))
-    run(copy, tmp_path / "r.h5", init_pose=file, frames=(0, 9))
+    reporter = Silent()
+    run(copy, tmp_path / "r.h5", init_pose=file, frames=(0, 9), reporter=reporter)
+    assert reporter.frames == [4, 5, 6, 7, 8]
+    assert any("frames before 4 are left out" in note for note in reporter.notes)
+    with pytest.raises(ConfigError, match=r"frames 0:2: the subject is found in frame 4"):
+        run(copy, tmp_path / "other.h5", init_pose=file, frames=(0, 2))
     found = read_result(tmp_path / "r.h5")
     np.testing.assert_array_equal(found.frames, np.arange(4, 9))
     assert found.status[0] == Status.INITIALISED and not (found.status == Status.LOST).any()
@@ -277,14 +278,10 @@ def test_masks_that_never_change_are_refused(tk: Tk, copy: Path, tmp_path: Path)
     tk("track", copy, "-o", tmp_path / "r.h5", "--config", slow).complaint(str(copy), "the masks never change")
 
 
-def test_frames_before_the_initial_one_are_left_out(copy: Path, tmp_path: Path) -> None:
+def test_the_initial_frame_of_the_capture_must_be_tracked(copy: Path, tmp_path: Path) -> None:
     without_first_pose(copy, ("frame = 0", "frame = 3"))
-    reporter = Silent()
-    track(open_capture(copy), tmp_path / "r.h5", CONFIG, reporter, frames=(1, 6))
-    assert reporter.frames == [3, 4, 5]
-    assert any("frames before 3 are left out" in note for note in reporter.notes)
     with pytest.raises(ConfigError, match=r"frames 0:2: the subject is found in frame 3"):
-        run(copy, tmp_path / "other.h5", frames=(0, 2))
+        run(copy, tmp_path / "r.h5", frames=(0, 2))
 
 
 def test_requested_frames_are_tracked(tiny: Path) -> None:

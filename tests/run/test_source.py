@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -24,12 +24,13 @@ from tk.io.captures.frames import FrameSet
 from tk.io.results.data import Result
 from tk.io.results.reader import read_result
 from tk.io.results.status import Status
+from tk.kernels.mask_values import PERSON
 from tk.model.body.angles import UNSEEN
 from tk.model.cameras.volume import Volume
 from tk.model.setup import InitPose, Setup, Subject
 from tk.run import offline
 from tk.run.draft import Draft
-from tk.run.session import estimates, track_task
+from tk.run.session import Summary, estimates, track_task
 from tk.run.task import Choice, Task, TrackOptions
 from tk.trackers.camera_monitor import CameraMonitor
 from tk.trackers.protocol import Estimate, Frame
@@ -81,6 +82,35 @@ class Rendered:
         return ()
 
 
+@contextmanager
+def told(poses: np.ndarray) -> Iterator[None]:
+    """Tell each tracker that is started the first pose of its person: of (P, F, D) the one that its masks show most of.
+
+    The search for somebody whose pose is not known takes longer than all else in a short run, and has its own tests.
+    """
+    start = RegionTracker.start
+
+    def start_there(tracker: RegionTracker, frames: Sequence[Frame], subject: Subject) -> None:
+        own = frames[0].masks >= PERSON
+
+        def shown(pose: np.ndarray) -> int:
+            joints, (height, width) = BODY.skeleton.joints(pose), own.shape[1:]
+            at = [camera.project(joints)[0].round().astype(int) for camera in tracker.rig]
+            places = [(y.clip(0, height - 1), x.clip(0, width - 1)) for x, y in (pixels.T for pixels in at)]
+            return sum(int(mask[place].sum()) for mask, place in zip(own, places, strict=True))
+
+        start(tracker, frames, replace(subject, init=first_pose(max(poses[:, frames[0].index], key=shown))))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RegionTracker, "start", start_there)
+        patch.setattr(RegionTracker, "anticipate", lambda *_: None)
+        yield
+
+
+def first_pose(pose: np.ndarray) -> InitPose:
+    return InitPose({}, dict(zip(NAMES, pose, strict=True)), None, STATURE)
+
+
 def task(setup: Setup, source: Rendered, **options: Any) -> Task:
     """Return the task of tracking a simulated source."""
     return Task(setup, source, TrackOptions(SETTINGS, **options))
@@ -126,6 +156,12 @@ def test_a_source_of_unknown_length_is_written_until_it_ends_and_the_second_pass
 
 EMPTY = 3
 LATE = Rendered(np.concatenate([0 * ONE.masks[:EMPTY], ONE.masks]))
+LATE_POSES = np.concatenate([POSES[:EMPTY], POSES])[None]
+
+
+def track_late(path: Path, reporter: Silent, setup: Setup = SETUP, resume: bool = False, **options: Any) -> Summary:
+    with told(LATE_POSES):
+        return track_task(task(setup, LATE, **options), path, reporter, resume=resume)
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +169,7 @@ def begun(tmp_path_factory: pytest.TempPathFactory) -> Result:
     """A run that begins with the first frame with somebody."""
     path = tmp_path_factory.mktemp("begun") / "r.h5"
     any_pose = replace(SETUP, subjects=(replace(SETUP.subjects[0], in_init_pose=False),))
-    track_task(task(any_pose, LATE, frames=(EMPTY, None)), path, Silent())
+    track_late(path, Silent(), any_pose, frames=(EMPTY, None))
     return read_result(path)
 
 
@@ -142,7 +178,7 @@ def test_frames_before_the_first_person_are_absent_and_the_others_as_if_tracking
     begun: Result, tmp_path: Path, people: Choice
 ) -> None:
     reporter, late = Silent(), tmp_path / "late.h5"
-    summary = track_task(task(SETUP, LATE, people=people), late, reporter)
+    summary = track_late(late, reporter, people=people)
     result = read_result(late)
     assert (result.status == Status.ABSENT).tolist() == EMPTY * [True] + len(POSES) * [False]
     assert summary.present == len(POSES) and reporter.frames == list(range(EMPTY + len(POSES)))
@@ -158,11 +194,11 @@ def test_a_run_that_began_with_an_empty_volume_is_resumed(
 ) -> None:
     run_clock(monkeypatch, EVERY_FRAME)
     part = tmp_path / "part.h5"
-    stopped = track_task(task(SETUP, LATE), part, StopAt(stop))
+    stopped = track_late(part, StopAt(stop))
     # frames are in the file from the first person on; before, there is none
     assert (stopped.interrupted, stopped.frames) == (True, stop + 1 if stop >= EMPTY else 0)
     assert part.exists() == (stop >= EMPTY) and len(list(tmp_path.iterdir())) == (2 if part.exists() else 0)
-    track_task(task(SETUP, LATE), part, Silent(), resume=True)
+    track_late(part, Silent(), resume=True)
     result = read_result(part)
     assert (result.status[:EMPTY] == Status.ABSENT).all()
     for name in ("pose", "status", "sigma"):
@@ -184,9 +220,9 @@ def test_a_run_that_fails_in_a_step_between_two_writes_is_resumed(
     any_pose = replace(SETUP, subjects=(replace(SETUP.subjects[0], in_init_pose=False),))
     with monkeypatch.context() as patched, refused(CaptureError, "broken"):
         patched.setattr(RegionTracker, "step", fail)
-        track_task(task(any_pose, LATE, frames=(EMPTY, None)), path, Silent())
+        track_late(path, Silent(), any_pose, frames=(EMPTY, None))
     assert len(read_result(path)) == 3
-    track_task(task(any_pose, LATE, frames=(EMPTY, None)), path, Silent(), resume=True)
+    track_late(path, Silent(), any_pose, resume=True, frames=(EMPTY, None))
     for name in ("frames", "pose", "status", "sigma"):
         np.testing.assert_array_equal(getattr(read_result(path), name), getattr(begun, name))
 
@@ -210,7 +246,8 @@ def test_a_start_that_fails_after_somebody_has_entered_is_repeated(monkeypatch: 
 
     monkeypatch.setattr(RegionTracker, "start", refuse)
     slow = replace(SETUP, fps=4.0)  # attempts are half a second apart
-    found = list(estimates(task(slow, LATE)))
+    with told(LATE_POSES):
+        found = list(estimates(task(slow, LATE)))
     assert [e.status for e in found][:6] == EMPTY * ["absent"] + 2 * ["lost"] + ["initialised"]
     assert attempts == [EMPTY, EMPTY + 2]
     refused_in += range(len(found))
@@ -229,8 +266,7 @@ FOUR = ring_of_cameras(4, width=160, height=200)
 MASKS = np.array([draw_silhouettes(BODY, FOUR, poses) for poses in BOTH])
 PAIR = replace(SETUP, rig=FOUR, subjects=(Subject(STATURE, body=BODY, in_init_pose=False),) * 2)
 # the same with their first poses, which saves the search for them
-FIRST = [InitPose({}, dict(zip(NAMES, poses[0], strict=True)), None, STATURE) for poses in BOTH]
-POSED = replace(PAIR, subjects=tuple(replace(PAIR.subjects[0], init=init) for init in FIRST))
+POSED = replace(PAIR, subjects=tuple(replace(PAIR.subjects[0], init=first_pose(poses[0])) for poses in BOTH))
 
 
 def far_off(joints: np.ndarray, person: int) -> float:
@@ -296,18 +332,20 @@ def test_the_subject_position_chooses_the_person() -> None:
         near = replace(PAIR.subjects[0], position=JOINTS[person][0, 0] + 0.1)
         notes: list[str] = []
         near_task = task(replace(PAIR, subjects=(near,)), Rendered(MASKS.max(axis=0)), frames=(0, 1))
-        (found,) = estimates(near_task, notes.append)
+        with told(BOTH):
+            (found,) = estimates(near_task, notes.append)
         assert any("2 people are in view" in note for note in notes)
         assert far_off(found.joints[None], person) < 0.1
 
 
 def test_a_number_that_nobody_gets_is_an_error_or_a_note(tmp_path: Path) -> None:
     source = Rendered(MASKS.max(axis=0))
-    with refused(CaptureError, "person 2 did not enter the working volume"):
+    with told(BOTH), refused(CaptureError, "person 2 did not enter the working volume"):
         track_task(task(POSED, source, people=(2,), frames=(0, 1)), tmp_path / "r.h5", Silent())
     assert not list(tmp_path.iterdir())
     reporter = Silent()
-    track_task(task(POSED, source, people=(2, 1), causal=True, frames=(0, 1)), tmp_path / "r.h5", reporter)
+    with told(BOTH):
+        track_task(task(POSED, source, people=(2, 1), causal=True, frames=(0, 1)), tmp_path / "r.h5", reporter)
     (found,) = read_result(tmp_path / "r.h5").people
     assert min(far_off(found.joints, who) for who in (0, 1)) < 0.04
     assert reporter.notes == [
@@ -329,7 +367,8 @@ def track_entering(
     masks[1, :1] = masks[1, 12:] = 0
     setup = replace(PAIR, fps=fps, subjects=PAIR.subjects[:1])
     options = TrackOptions(ONE_POSE, people=people, causal=True, frames=(0, stop))
-    track_task(Task(setup, Rendered(masks.max(axis=0)), options), path, Silent(), resume=resume)
+    with told(ENTER):
+        track_task(Task(setup, Rendered(masks.max(axis=0)), options), path, Silent(), resume=resume)
     return read_result(path).people
 
 

@@ -74,6 +74,7 @@ def test_clutter_is_read_between_thresholds() -> None:
     assert np.isnan(curve.at(0.95, "shadow")), "not reached, not made up"
 
 
+@pytest.mark.slow
 def test_figure_and_table_are_made_from_a_capture(tmp_path: Path) -> None:
     curves = run([development_capture("walk")], [30], tmp_path, cameras=["cam1", "cam2"])
     assert (tmp_path / "figure4-walk.png").stat().st_size > 20_000

@@ -1,9 +1,12 @@
 """The tables of the silhouette paper at a small size."""
 
+import pytest
+
 from scripts import silhouette_tables
 from tests.conftest import development_capture
 
 
+@pytest.mark.slow
 def test_a_few_frames_of_the_treadmill_make_a_row_and_a_figure(tmp_path):
     data = silhouette_tables.load(development_capture("treadmill-slow"), ("cam3", "cam6", "cam1", "cam4"), 6)
     assert data.rig.names == ("cam3", "cam6", "cam1", "cam4")

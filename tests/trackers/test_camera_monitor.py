@@ -297,9 +297,9 @@ def test_mask_with_surplus_area_is_left_out_if_the_others_fit_better_without_it(
             masks[camera] = cv2.dilate(masks[camera], np.ones((9, 9), np.uint8))
         return replace(frame, masks=masks)
 
-    monitor, estimates, used = scene.follow(too_wide)
+    monitor, estimates, used = scene.follow(too_wide, 10)
     if camera == 1:  # the rest gains hardly anything without one of the others: its mask may be used, and misleads none
-        assert sum(not u[camera] for u in used[4:]) >= FRAMES / 2 and not used[-1][camera]
+        assert sum(not u[camera] for u in used[4:]) >= 5 and not used[-1][camera]
     assert all(u[[c for c in range(4) if c != camera]].all() for u in used)
     assert all(f"camera cam{camera + 1}" in line for line in monitor.report())
     assert scene.error(estimates) < 0.04

@@ -56,6 +56,9 @@ class Hdf5Reader:
         self.shapes: dict[str, tuple[int, ...]] = {}
         self.groups: set[str] = {""}
         self._file = file
+        # objects that are open: to find one by its name takes as long as to read it
+        self._datasets: dict[str, h5py.h5d.DatasetID] = {}
+        self._holders: dict[str, h5py.AttributeManager] = {}
         self._bytes = path.stat().st_size
         with self._guarded("/"):
             _check_text_heaps(path, file)
@@ -134,7 +137,7 @@ class Hdf5Reader:
         for name in self.below(group):
             path = f"{group}/{name}"
             with self._guarded(path):
-                dataset = self._file[path]
+                dataset = h5py.Dataset(self._datasets[path])
                 is_text = dataset.id.get_type().get_class() == h5py.h5t.STRING
                 value = dataset[()] if is_text else self._numbers(path)[()]
                 found[name] = value.decode() if isinstance(value, bytes) else value
@@ -146,14 +149,16 @@ class Hdf5Reader:
     def attribute(self, holder: str, name: str) -> Any:
         """Return an attribute of a dataset or group: texts, numbers, or arrays of them; None if it does not exist."""
         with self._guarded(f"{holder}, attribute {name},"):
-            held = self._file[f"/{holder}"]
-            if name not in held.attrs:
+            if holder not in self._holders:
+                self._holders[holder] = self._file[f"/{holder}"].attrs
+            attributes = self._holders[holder]
+            if name not in attributes:
                 return None
-            found = held.attrs.get_id(name)
+            found = attributes.get_id(name)
             size = math.prod(found.shape) * found.get_type().get_size()
             if found.get_type().get_class() not in (*_NUMBERS, h5py.h5t.STRING) or size > MAX_ATTRIBUTE_BYTES:
                 self.fail(f"the attribute {name} of /{holder} is neither text nor numbers; the file is damaged")
-            value = held.attrs[name]
+            value = attributes[name]
             return text_of(value) if isinstance(value, (bytes, str)) else value
 
     def is_format(self, name: str) -> bool:
@@ -191,11 +196,13 @@ class Hdf5Reader:
     def _numbers(self, name: str) -> NDArray[Any]:
         """Return a dataset of numbers. Each NaN becomes numpy's NaN, because other NaN bits cause warnings later."""
         with self._guarded(name):
-            dataset = self._file[name]
-            kind = dataset.dtype.kind if dataset.id.get_type().get_class() in _NUMBERS else "?"
-            if kind not in "fiub" or dataset.dtype.itemsize > 8:
+            stored = self._datasets[name]
+            kind = stored.dtype.kind if stored.get_type().get_class() in _NUMBERS else "?"
+            if kind not in "fiub" or stored.dtype.itemsize > 8:
                 self.fail(f"/{name} does not hold numbers; the file is damaged")
-            values = np.asarray(dataset[()])
+            values = np.empty(stored.shape, stored.dtype)
+            if values.size:
+                stored.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
             return np.where(np.isnan(values), np.asarray(np.nan, values.dtype), values) if kind == "f" else values
 
     @contextlib.contextmanager
@@ -223,7 +230,8 @@ class Hdf5Reader:
                     self.groups.add(path)
                     waiting.append((path, depth + 1))
                 elif kind == h5py.h5o.TYPE_DATASET:
-                    self.shapes[path] = self._check_storage(path, h5py.h5d.open(group, link.encode()))
+                    dataset = self._datasets[path] = h5py.h5d.open(group, link.encode())
+                    self.shapes[path] = self._check_storage(path, dataset)
                 if len(self.shapes) + len(self.groups) > MAX_OBJECTS:
                     self.fail(f"holds more than {MAX_OBJECTS} groups and datasets; the file is damaged")
 

@@ -86,7 +86,7 @@ def test_tracking_starts_from_keypoints(detected: Path, tiny: Path, tmp_path: Pa
     for name, init in (("settings", None), ("option", detected)):
         capture = opened if init is None else replace(opened, init_keypoints=None)
         config = settings_file.from_toml(QUICK)
-        track(capture, tmp_path / f"{name}.h5", config, frames=(FRAME, 8), init_pose=init, causal=True)
+        track(capture, tmp_path / f"{name}.h5", config, frames=(FRAME, FRAME + 1), init_pose=init, causal=True)
         results.append(read_result(tmp_path / f"{name}.h5"))
     np.testing.assert_array_equal(results[0].pose, results[1].pose)
     truth = read_joints(tiny / "truth.h5").positions[results[0].frames]
