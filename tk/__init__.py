@@ -1,4 +1,4 @@
-"""Markerless motion capture from a few calibrated cameras: no markers, no trained weights, no GPU.
+"""Markerless motion capture from a few calibrated cameras: no markers, no GPU.
 
     import tk
 

@@ -15,7 +15,7 @@ from tk.io.results.reader import read_result
 from tk.io.results.status import Status
 from tk.model.body.angles import standing_axes
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.joints import FOOT_POINTS, JOINTS, REQUIRED_JOINTS, ROWS, SEGMENT_ORIGIN, SEGMENTS, segment_below
+from tk.model.body.joints import FOOT_POINTS, JOINTS, ROWS, SEGMENT_ORIGIN, SEGMENTS, segment_below
 from tk.model.body.rotations import to_matrices
 from tk.model.body.skeleton import Skeleton, skeleton_of_names
 from tk.model.motion.derived import derive
@@ -119,7 +119,7 @@ def motion_of(result: Result, smoothed: bool = False) -> tuple[Motion, tuple[str
         result = _derived(result, skeleton, dimensions, joints=is_made_here)
     assert result.segments_rotation is not None and result.feet is not None
     segments = result.meta.segment_names
-    missing = [ROWS[name].carrier for name in REQUIRED_JOINTS if ROWS[name].carrier not in segments]
+    missing = [ROWS[name].carrier for name in JOINTS if ROWS[name].carrier not in segments]
     if missing:
         raise ResultError(f"{path}: /segments/rotation has no segment {missing[0]}; track the capture again")
     joints = [JOINTS.index(name) for name in joint_names]

@@ -300,8 +300,8 @@ class TwoPassTracker(Tracker, Protocol):
         self, masks: Sequence[NDArray[np.uint8]], poses: Float, height_m: float | None, measured: Measured
     ) -> tuple[TwoPassTracker, ...]:
         """Return two trackers, whose bodies are fitted to a person with the heading of the poses, and with the opposite
-        one; none if the opposite heading is improbable (1e-3). Arguments as for :meth:`cost`, and the subject's height
-        if known."""
+        one; none if the opposite heading is improbable (1e-3). Arguments as for :meth:`trajectory_cost`, and the
+        subject's height if known."""
         ...
 
     def turned_pose(self, pose: Float) -> Float:

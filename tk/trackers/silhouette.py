@@ -4,8 +4,8 @@ It uses neither voxels nor colours, so two or three cameras and their masks are 
 
     masks → cleaned, scales → {contours → edgels along their normals → normal equations → step} × iterations × scales
 
-Beyond the paper, a limb search runs at intervals (:meth:`ContourFinder.search`): a silhouette hides an arm in front of
-or behind the trunk, and when the arm reappears, no contour may be near it.
+Beyond the paper, a limb search runs at intervals (:mod:`tk.trackers.proposals.limbs`): a silhouette hides an arm in
+front of or behind the trunk, and when the arm reappears, no contour may be near it.
 """
 
 from __future__ import annotations

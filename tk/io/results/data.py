@@ -312,8 +312,8 @@ class Result:
         return to_xarray(self)
 
     def in_joint_order(self) -> Result:
-        """Return the result with its joints in the order of :data:`~tk.model.body.joints.JOINTS`; NaN where the file
-        has no such joint. ``smoothed`` and ``others`` keep their order: call :meth:`with_smoothed` first.
+        """Return the result with its joints in the order of :data:`~tk.model.body.joints.JOINTS`. ``smoothed`` and
+        ``others`` keep their order: call :meth:`with_smoothed` first.
 
         Raises:
             ResultError: a joint that every result has is missing.

@@ -62,9 +62,6 @@ class Joint:
     carrier: str = ""  # the segment that carries the joint centre in `/joints/position`; empty: not an output
     bone_from: str = ""  # the joint at the other end of the bone in drawings; empty at the root
     offset_m: float = np.nan  # constant offset of the output joint from a ground truth's, mean length, metres
-    # True for an output joint beyond the 15 that every result and ground truth has; readers return NaN for a file
-    # without it
-    added: bool = False
 
     @property
     def kind(self) -> str:
@@ -204,10 +201,8 @@ TABLE: tuple[Joint, ...] = (
 )
 ROWS = {row.name: row for row in TABLE}
 
-#: joints of `/joints/position`: those that every file has, then the added ones
-JOINTS = tuple(row.name for added in (False, True) for row in TABLE if row.carrier and row.added == added)
-#: those that every result and ground truth has
-REQUIRED_JOINTS = tuple(name for name in JOINTS if not ROWS[name].added)
+#: joints of `/joints/position`, which every result and ground truth has
+JOINTS = tuple(row.name for row in TABLE if row.carrier)
 #: segments of `/segments/rotation`: what the paper's joints turn, then what the others turn
 SEGMENTS = tuple(row.turns for added in (False, True) for row in TABLE if row.turns and row.is_added == added)
 #: names of the degrees of freedom of the bodies that results have: tk's body, the same in files written before the
@@ -274,16 +269,10 @@ def segment_below(joint: str) -> str:
 
 
 def in_joint_order(values: Float, names: Sequence[str]) -> Float:
-    """Return values (F, J, ...) of :data:`JOINTS` from values (F, K, ...) of joints ``names``; NaN for absent ones.
+    """Return values (F, J, ...) of :data:`JOINTS` from values (F, K, ...) of joints ``names``.
 
     Raises:
-        KeyError: the first of :data:`REQUIRED_JOINTS` that is absent.
+        KeyError: the first joint that is absent.
     """
-    for name in REQUIRED_JOINTS:
-        if name not in names:
-            raise KeyError(name)
-    result = np.full((len(values), len(JOINTS), *values.shape[2:]), np.nan)
-    for k, name in enumerate(JOINTS):
-        if name in names:
-            result[:, k] = values[:, names.index(name)]
-    return result
+    places = {name: k for k, name in enumerate(names)}
+    return np.asarray(values, np.float64)[:, [places[name] for name in JOINTS]]

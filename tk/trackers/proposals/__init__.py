@@ -1,3 +1,3 @@
-"""Proposals of poses. Each module has one function ``propose``, which takes the tracker, what a frame shows, and the
-present pose, and returns other poses (B, D), settled at the coarser scales. It decides nothing: the tracker settles
-them at the finest scale, compares all poses by one cost, and chooses."""
+"""Proposals of poses. The function ``propose`` of each module takes what a frame shows and what it proposes beside, and
+returns other poses (B, D). It decides nothing: the tracker settles them at the finest scale, compares all poses by one
+cost, and chooses."""
