@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from tests.conftest import development_capture
 from tk.errors import CaptureError
 from tk.model.masks.background import median_plate, reduced
-from tk.model.masks.foreground import CollinearityForeground
+from tk.model.masks.foreground import CollinearityForeground, Prior
+from tk.model.masks.learned_scene import LearnedScene
 from tk.model.masks.regions import clean_by_area
 
 SHAPE = (120, 160)
@@ -263,3 +264,20 @@ def test_a_shadow_that_people_enclose_is_no_person():
     shown[:, hole] = np.array([85, 101, 117])  # grey cloth: darker than the scene, and without its structure
     for mask in foreground.label(expose(shown.astype(np.uint8), rng, noise=1.0))[0]:
         assert np.mean(mask[hole] > 0) > 0.9
+
+
+def test_where_a_learned_scene_is_unknown_the_prior_decides():
+    """The image stands for the scene there, which is no sign of a shadow."""
+    rng = np.random.default_rng(12)
+    scene = np.clip(rng.normal(110, 14, (1, *SHAPE, 1)) * np.array([0.8, 0.95, 1.1]), 0, 255).astype(np.uint8)
+    unknown, ring, hole = (np.zeros(SHAPE, np.uint8) for _ in range(3))
+    cv2.rectangle(unknown, (40, 20), (100, 84), 1, cv2.FILLED)
+    cv2.circle(ring, (70, 50), 24, 1, 10)
+    cv2.circle(hole, (70, 50), 20, 1, cv2.FILLED)
+    learned = LearnedScene(scene, unknown[None] > 0)
+    foreground = CollinearityForeground.of_learned(learned, SIZES[:1])
+    image = expose(scene, rng, noise=1.0)
+    image[:, ring > 0] = image[:, 70:112, 62:78] = (40, 40, 200)  # reaches out of the unknown part
+    prior = Prior.of(255 * ring[None], (hole & (1 - ring))[None] > 0)
+    (mask,), _ = foreground.label(image, prior=prior)
+    assert np.mean(mask[(ring | hole) > 0] > 0) > 0.9

@@ -346,6 +346,7 @@ class CollinearityForeground:
         certain = without_penumbrae(statistic.labels, difference, collinearity, _PENUMBRA, _CORE)
         if not self._learned:
             certain |= statistic.bright.view(np.bool_)
+        unknown = np.zeros_like(seen)
         if self._small_unknown is not None and prior is not None:
             unknown, shown, possible = (
                 _gathered(mosaic, each) for each in (self._small_unknown, prior.person, prior.possible)
@@ -354,10 +355,10 @@ class CollinearityForeground:
             np.copyto(collinearity, 255, where=unknown & shown)
             np.copyto(seen, shown | possible, where=unknown)
         unsure = seen & ~certain
-        pixels = np.flatnonzero(unsure)
+        pixels = np.flatnonzero(unsure & ~unknown)
         evidence = self._shadow_evidence(mosaic, pixels, noise)
-        certain.reshape(-1)[pixels[evidence < -_SURE]] = True
-        unsure.reshape(-1)[pixels[np.abs(evidence) > _SURE]] = False
+        np.put(certain, pixels[evidence < -_SURE], True)
+        np.put(unsure, pixels[np.abs(evidence) > _SURE], False)
         foreground = certain | enclosed(unsure, certain, _ENCLOSURE)
         foreground |= unsure & closed(foreground, self._bridge)
         area_min = self._area_min / _REDUCTION**2
