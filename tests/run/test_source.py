@@ -83,8 +83,8 @@ class Rendered:
 
 
 @contextmanager
-def told(poses: np.ndarray) -> Iterator[None]:
-    """Tell each tracker that is started the first pose of its person: of (P, F, D) the one that its masks show most of.
+def starting_at(poses: np.ndarray) -> Iterator[None]:
+    """Start each tracker at the first pose of its person: of (P, F, D) the one that its masks show most of.
 
     The search for somebody whose pose is not known takes longer than all else in a short run, and has its own tests.
     """
@@ -160,7 +160,7 @@ LATE_POSES = np.concatenate([POSES[:EMPTY], POSES])[None]
 
 
 def track_late(path: Path, reporter: Silent, setup: Setup = SETUP, resume: bool = False, **options: Any) -> Summary:
-    with told(LATE_POSES):
+    with starting_at(LATE_POSES):
         return track_task(task(setup, LATE, **options), path, reporter, resume=resume)
 
 
@@ -246,7 +246,7 @@ def test_a_start_that_fails_after_somebody_has_entered_is_repeated(monkeypatch: 
 
     monkeypatch.setattr(RegionTracker, "start", refuse)
     slow = replace(SETUP, fps=4.0)  # attempts are half a second apart
-    with told(LATE_POSES):
+    with starting_at(LATE_POSES):
         found = list(estimates(task(slow, LATE)))
     assert [e.status for e in found][:6] == EMPTY * ["absent"] + 2 * ["lost"] + ["initialised"]
     assert attempts == [EMPTY, EMPTY + 2]
@@ -332,7 +332,7 @@ def test_the_subject_position_chooses_the_person() -> None:
         near = replace(PAIR.subjects[0], position=JOINTS[person][0, 0] + 0.1)
         notes: list[str] = []
         near_task = task(replace(PAIR, subjects=(near,)), Rendered(MASKS.max(axis=0)), frames=(0, 1))
-        with told(BOTH):
+        with starting_at(BOTH):
             (found,) = estimates(near_task, notes.append)
         assert any("2 people are in view" in note for note in notes)
         assert far_off(found.joints[None], person) < 0.1
@@ -340,11 +340,11 @@ def test_the_subject_position_chooses_the_person() -> None:
 
 def test_a_number_that_nobody_gets_is_an_error_or_a_note(tmp_path: Path) -> None:
     source = Rendered(MASKS.max(axis=0))
-    with told(BOTH), refused(CaptureError, "person 2 did not enter the working volume"):
+    with starting_at(BOTH), refused(CaptureError, "person 2 did not enter the working volume"):
         track_task(task(POSED, source, people=(2,), frames=(0, 1)), tmp_path / "r.h5", Silent())
     assert not list(tmp_path.iterdir())
     reporter = Silent()
-    with told(BOTH):
+    with starting_at(BOTH):
         track_task(task(POSED, source, people=(2, 1), causal=True, frames=(0, 1)), tmp_path / "r.h5", reporter)
     (found,) = read_result(tmp_path / "r.h5").people
     assert min(far_off(found.joints, who) for who in (0, 1)) < 0.04
@@ -367,7 +367,7 @@ def track_entering(
     masks[1, :1] = masks[1, 12:] = 0
     setup = replace(PAIR, fps=fps, subjects=PAIR.subjects[:1])
     options = TrackOptions(ONE_POSE, people=people, causal=True, frames=(0, stop))
-    with told(ENTER):
+    with starting_at(ENTER):
         track_task(Task(setup, Rendered(masks.max(axis=0)), options), path, Silent(), resume=resume)
     return read_result(path).people
 
