@@ -99,7 +99,8 @@ def confirmed(found: Agreement, rig: Rig, landmarks: Sequence[Float | None], bad
     unseen = len(rig) == 2 and apart * AVERAGE_STATURE_M < 2 * deviation(np.array(1.0))
     if not seen or unseen or not (found.wrong or found.refusal):
         return found
-    return found.confirmed(evidence_for_cameras(rig, seen))
+    turned = {c: found.shift_px[c] / found.reductions[c] for c in found.wrong if np.hypot(*found.shift_px[c]) > 0}
+    return found.confirmed(evidence_for_cameras(rig, seen, turned))
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,17 @@ def test_turned_camera_is_contradicted_and_the_others_are_confirmed(c: int) -> N
     assert (np.delete(evidence, c) > 0).all()
 
 
+@pytest.mark.parametrize("by", [3.0, -3.0])
+def test_small_turn_is_noticed_where_the_masks_show_it(by: float) -> None:
+    """Cameras at one height: two that are turned to the side by 3° still fit the landmarks of the others."""
+    rig = turned(turned(RIG, 1, by), 3, -by)
+    shift = by * np.radians(1.0) * RIG[1].matrix[0, 0]
+    undone = {1: np.array([shift, 0.0]), 3: np.array([-shift, 0.0])}
+    assert (evidence_for_cameras(rig, seen())[[1, 3]] > 0).all()
+    assert (evidence_for_cameras(rig, seen(), undone)[[1, 3]] < -1.0).all()
+    assert (evidence_for_cameras(RIG, seen(), undone) > 1.0).all()  # the masks are wrong
+
+
 def test_frames_of_an_opening_count_as_one() -> None:
     one = seen(POSES[:1])
     np.testing.assert_allclose(evidence_for_cameras(RIG, one * 4), evidence_for_cameras(RIG, one))

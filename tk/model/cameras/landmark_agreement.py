@@ -8,7 +8,7 @@ make the joints of a person agree in all images.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
@@ -30,26 +30,44 @@ REACH_M = 1.0
 _TRUNK = [LANDMARKS.index(name) for name in (*SHOULDERS, *HIPS)]
 
 
-def evidence_for_cameras(rig: Rig, landmarks: Sequence[Float]) -> Float:
+def evidence_for_cameras(rig: Rig, landmarks: Sequence[Float], turned: Mapping[int, Float] | None = None) -> Float:
     """Return (C,) the logarithm of the likelihood ratio, nats, of each camera being right against being wrong; NaN
     without landmarks of one person in it and in another one.
 
-    A camera is compared with the others that agree; if no two do, with the one that it fits best.
+    A camera is compared with the others that agree; if no two do, with the one that it fits best. One that may be
+    turned is compared with those that are not, and its landmarks must be likelier where they are than where they would
+    be if it had not been turned: those of a camera that is turned by 3° are still nearer to the projections than other
+    points of a person.
 
     Frames of an opening err alike, so they count as one: the mean over the frames is returned.
 
     Args:
         rig: C cameras.
         landmarks: (N, C, L, 4) of N people in each of some frames; NaN if unknown.
+        turned: of cameras that may be turned the shift (2,), pixels, that undoes it.
     """
     total, count = np.zeros(len(rig)), np.zeros(len(rig))
     for people in landmarks:
-        own = [_Pairs.of(_Sets.of(rig, seen)) for seen in people]
-        found = np.array([pairs.evidence() for pairs in own]).reshape(-1, len(rig))
+        found = np.array([_evidence(rig, seen, turned or {}) for seen in people]).reshape(-1, len(rig))
         known = np.isfinite(found)
         total += np.where(known, found, 0.0).sum(axis=0)
         count += known.any(axis=0)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _evidence(rig: Rig, seen: Float, turned: Mapping[int, Float]) -> Float:
+    """Return :func:`evidence_for_cameras` of landmarks (C, L, 4) of one person in one frame."""
+    found = _Pairs.of(_Sets.of(rig, seen)).evidence()
+    for c, shift in turned.items():
+        cameras = [k for k in range(len(rig)) if k == c or k not in turned]
+        back = seen.copy()
+        back[c, :, :2] += shift
+        beside = Rig(tuple(rig[k] for k in cameras))
+        here, there = (
+            _Pairs.of(_Sets.of(beside, marked[cameras])).evidence()[cameras.index(c)] for marked in (seen, back)
+        )
+        found[c] = here - np.fmax(there, 0.0)
+    return found
 
 
 def associated(rig: Rig, landmarks: Float) -> Float:
