@@ -238,7 +238,7 @@ def test_camera_that_shows_nothing_of_the_person_is_reported(scene: Scene, cover
         return replace(frame, images=images, masks=masks)
 
     monitor, estimates, _ = scene.follow(spoil, 9)
-    state, text = ("torn", FAULTS["torn"].text) if covered else ("unseen", FAULTS["unseen"].text)
+    state, text = ("torn", FAULTS["torn"]) if covered else ("unseen", FAULTS["unseen"])
     for i, e in enumerate(estimates):
         assert e.residual is not None and e.cameras is not None
         assert np.isnan(e.residual[:, 0]).tolist() == [False, False, i >= 5, False]

@@ -297,10 +297,21 @@ def test_a_torn_mask_is_left_out_in_its_frames_only() -> None:
 
 def test_a_wrong_camera_is_used_again_when_its_residual_is_normal() -> None:
     cameras = Cameras(CAMERAS, 15.0)
-    cameras.be(1, WRONG)
+    cameras.accuse(1)
     for _ in range(5):
         cameras.weigh(~EVERYBODY | (np.arange(CAMERAS) == 1), areas(9.0, 9.0))
         assert STATES[cameras.states[1]] == WRONG
     for _ in range(3):
         cameras.weigh(EVERYBODY, areas(0.0, 0.0))
     assert not cameras.states.any()
+
+
+def test_a_wrong_camera_is_still_wrong_after_its_image_was_covered() -> None:
+    cameras = Cameras(CAMERAS, 15.0)
+    cameras.accuse(1)
+    states = []
+    for fault in ("blank", "blank", None):
+        cameras.look([None, fault, *[None] * (CAMERAS - 2)])
+        states.append((STATES[cameras.states[1]], bool(cameras.unfit[1])))
+    assert states == [("blank", True), ("blank", True), (WRONG, False)]
+    assert not np.delete(cameras.states, 1).any()

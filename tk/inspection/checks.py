@@ -175,7 +175,7 @@ def _read(capture: Capture, config: Settings, span: range, compared: set[int], k
                 read.small[i] = sampled(frame.images, labels.masks)
                 for bad, reason in zip(read.bad_images, health.look(frame.images, read.masks[i]), strict=True):
                     if reason is not None:
-                        bad[i] = FAULTS[reason].text
+                        bad[i] = FAULTS[reason]
             if i in kept:
                 read.images[i] = frame.images.copy()
     return read

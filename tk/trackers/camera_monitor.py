@@ -172,13 +172,12 @@ class CameraMonitor(Stateful[MonitorState]):
         if self._region is not None:
             self._region.view_m = float(np.hypot(CHANGING_M, agreement.undetected_m))
         for camera in agreement.wrong:
-            self._cameras.be(camera, WRONG)
+            self._cameras.accuse(camera)
             self._opening_reasons[camera] = agreement.reason(camera)
         out = self._cameras.states > 0
         if out.any() and not self.tracker.can_exclude_cameras:
             reasons = (
-                f"camera {self._names[c]} {FAULTS[WRONG].text} ({reason})"
-                for c, reason in self._opening_reasons.items()
+                f"camera {self._names[c]} {FAULTS[WRONG]} ({reason})" for c, reason in self._opening_reasons.items()
             )
             raise CaptureError(f"{'; '.join(reasons)}: this method needs masks that fit from all cameras")
         alone = not any((f.masks == OTHERS).any() for f in frames)  # the hull of two people is larger than one
@@ -300,9 +299,7 @@ class CameraMonitor(Stateful[MonitorState]):
             camera, _, state = key.partition("/")
             because = self._opening_reasons.get(int(camera)) if state == WRONG else None
             more = f" ({because})" if because else ""
-            lines.append(
-                f"camera {self._names[int(camera)]} {FAULTS[state].text}{more}: left out of {described(*span)}"
-            )
+            lines.append(f"camera {self._names[int(camera)]} {FAULTS[state]}{more}: left out of {described(*span)}")
         return lines
 
 

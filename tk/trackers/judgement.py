@@ -1,8 +1,8 @@
 """One account of the evidence: when a camera is left out, and when a frame is lost, suspect or without sigma.
 
 **Cameras.** A camera is right, or it has one of :data:`FAULTS`. Evidence of its image
-(:mod:`tk.model.masks.image_health`) is certain, and counts for one frame. Evidence of its mask is the missing and the
-surplus area, as excess above the camera's baseline, in spreads. Three states explain it:
+(:mod:`tk.model.masks.image_health`) is certain, and counts for one frame; what was known before stays. Evidence of its
+mask is the missing and the surplus area, as excess above the camera's baseline, in spreads. Three states explain it:
 
 - right: both areas are normal.
 - poor: in a part of the frames, pieces of the person are missing from the mask, and it shows pieces of other things,
@@ -28,7 +28,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,25 +56,17 @@ FASTEST_M_S, TRUNK_ERROR_M = 12.0, 0.2
 _TRUNK = JOINTS.index("pelvis"), JOINTS.index("neck")
 
 
-class Fault(NamedTuple):
-    """A fault of a camera: the text for the user, and whether it is certain, because the image itself shows it."""
-
-    text: str
-    certain: bool
-
-
 WRONG, TORN, UNSEEN = "wrong", "torn", "unseen"
-#: faults of a camera by the names of its states
+#: faults of a camera, in words for the user, by the names of its states
 FAULTS = {
-    WRONG: Fault("disagrees with the others", False),
-    TORN: Fault("shows other things, or misses a part of the person", False),
-    **{name: Fault(text, True) for name, (text, _) in IMAGE_FAULTS.items()},
-    UNSEEN: Fault("does not see the person", False),
+    WRONG: "disagrees with the others",
+    TORN: "shows other things, or misses a part of the person",
+    **{name: text for name, (text, _) in IMAGE_FAULTS.items()},
+    UNSEEN: "does not see the person",
 }
 STATES = ("used", *FAULTS)
-_CERTAIN = np.array([False, *(fault.certain for fault in FAULTS.values())])
 #: meaning of each value of `/evidence/camera`
-STATE_MEANINGS = ("0: used", *(f"{value}: {fault.text}" for value, fault in enumerate(FAULTS.values(), 1)))
+STATE_MEANINGS = ("0: used", *(f"{value}: {text}" for value, text in enumerate(FAULTS.values(), 1)))
 
 # A camera becomes wrong once in eleven minutes, a mask poor once in half a minute; both last five seconds. These rates
 # are assumed, and so are the shares below.
@@ -105,9 +96,11 @@ def likelihoods(excess: Float, spread: Float) -> Float:
 
 @dataclass(frozen=True)
 class Belief:
-    """(C, 1 + S) the probability that each camera is right, that its mask is poor, and of each other state."""
+    """(C, 3) the probability that each camera is right, that its mask is poor, and that it is wrong; and (C,) the fault
+    of its image, an index in :data:`STATES`, 0 without one."""
 
     probability: Float
+    fault: NDArray[np.uint8]
 
 
 class Cameras(Stateful[Belief]):
@@ -116,8 +109,8 @@ class Cameras(Stateful[Belief]):
     State = Belief
 
     def __init__(self, count: int, fps: float) -> None:
-        self._probability = np.zeros((count, 1 + len(STATES)))
-        self._probability[:, 0] = 1.0
+        self._probability = np.tile([1.0, 0.0, 0.0], (count, 1))
+        self._fault = np.zeros(count, np.uint8)
         self._fps = fps
         begin, poor, end = _BEGIN_HZ / fps, min(_POOR_HZ / fps, 0.5), min(_END_HZ / fps, 0.5)
         after = end * _POOR_HZ / (_END_HZ + _POOR_HZ)  # the mask of a camera that was wrong may be poor
@@ -129,32 +122,29 @@ class Cameras(Stateful[Belief]):
 
     @property
     def states(self) -> NDArray[np.uint8]:
-        """(C,) index of each camera's state in :data:`STATES`; 0 unless a fault is likelier than none."""
-        faults = 1 + self._probability[:, 2:].argmax(axis=1)
-        return np.where(self._probability[:, :2].sum(axis=1) < 0.5, faults, 0).astype(np.uint8)
+        """(C,) index of each camera's state in :data:`STATES`; 0 unless its image has a fault, or it is more likely
+        wrong than not."""
+        wrong = np.where(self._probability[:, 2] > 0.5, np.uint8(STATES.index(WRONG)), np.uint8(0))
+        return np.where(self._fault > 0, self._fault, wrong)
 
     @property
     def unfit(self) -> Bool:
         """(C,) cameras whose image shows that they cannot be used."""
-        return np.asarray(_CERTAIN[self.states])
+        return np.asarray(self._fault > 0)
 
-    def be(self, camera: int, state: str) -> None:
-        """Take a camera's state for certain."""
-        index = STATES.index(state)
-        self._probability[camera] = 0.0
-        self._probability[camera, index + (index > 0)] = 1.0
+    def accuse(self, camera: int) -> None:
+        """Take it for certain that a camera is wrong."""
+        self._probability[camera] = 0.0, 0.0, 1.0
 
     def look(self, faults: Sequence[str | None]) -> None:
         """Take in the faults of the images of the next frame; None for an image without one."""
-        for camera, (fault, was) in enumerate(zip(faults, self.unfit, strict=True)):
-            if fault is not None or was:
-                self.be(camera, fault or "used")
+        self._fault = np.array([0 if fault is None else STATES.index(fault) for fault in faults], np.uint8)
 
     def weigh(self, cameras: Bool, likelihood: Float) -> None:
         """Weigh cameras (C,) by the likelihoods (C, 3) of their residual."""
         nats = self._expected() + likelihood
         for camera in np.flatnonzero(cameras):
-            self._probability[camera, :3] = _normalised(nats[camera])
+            self._probability[camera] = _normalised(nats[camera])
 
     def accused(self, likelihood: Float, best: Float, kept: Bool) -> int | None:
         """Return which of the cameras used, ``kept`` (C,), is to be judged; None if none is.
@@ -194,14 +184,14 @@ class Cameras(Stateful[Belief]):
                 poor + np.log(_TORN) + without[camera, 1] + fewer,
             ])
         )  # fmt: skip
-        self._probability[camera, :3] = probability[:3] + np.array([0.0, probability[3], 0.0])
+        self._probability[camera] = probability[:3] + np.array([0.0, probability[3], 0.0])
         if self.states[camera]:
             return WRONG
         return TORN if probability[2:].sum() > 0.5 else None
 
     def _expected(self) -> Float:
         """Return (C, 3) logarithms of the probabilities of the states, before the frame's masks are seen."""
-        return np.asarray(np.log(np.maximum(self._probability[:, :3] @ self._transition, np.finfo(np.float64).tiny)))
+        return np.asarray(np.log(np.maximum(self._probability @ self._transition, np.finfo(np.float64).tiny)))
 
     def _marginal(self, likelihood: Float, cameras: Bool) -> float:
         """Return the logarithm of the likelihood of cameras (C,) in unknown states, from those (C, 3) of each state."""
