@@ -22,13 +22,16 @@ NOBODY = np.zeros_like(MASKS[0])
 CLOSE_M = 0.03
 
 
-def tracked_back(lost: list[int], frames: np.ndarray, nobody_in: int | None = None) -> dict[int, Estimate]:
-    """What is found in the lost rows of a run; it has these frames' masks, and nowhere a pose in a lost one."""
+def tracked_back(
+    lost: list[int], frames: np.ndarray, unseen_in: int | None = None, by: int = len(RIG)
+) -> dict[int, Estimate]:
+    """What is found in the lost rows of a run; it has these frames' masks, and nowhere a pose in a lost one. In one row
+    the first cameras, ``by`` of them, see nobody."""
     tracker, store = RegionTracker(RIG, "z", SilhouetteSettings(adapt=False)), MaskStore()
     init = InitPose({}, dict(zip(NAMES, POSES[0], strict=True)), None, STATURE)
     tracker.start([observe(MASKS[0])], Subject(init=init, body=BODY))
     for row, (number, masks) in enumerate(zip(frames.tolist(), MASKS, strict=True)):
-        store.put(number, NOBODY if row == nobody_in else masks)
+        store.put(number, np.concatenate([NOBODY[:by], masks[by:]]) if row == unseen_in else masks)
     is_lost = np.isin(np.arange(len(POSES)), lost)
     poses = np.where(is_lost[:, None], np.nan, POSES)
     residual = np.where(is_lost[:, None, None], np.nan, np.full((len(POSES), 3, 2), 0.02))
@@ -44,8 +47,9 @@ def test_the_person_is_found_from_the_frames_after_a_stretch(lost: list[int]) ->
         assert estimate.status == "tracked"
 
 
-def test_frames_before_one_without_anybody_stay_lost() -> None:
-    assert sorted(tracked_back([1, 2, 3, 4], np.arange(7), nobody_in=2)) == [3, 4]
+@pytest.mark.parametrize(("by", "found"), [(1, [1, 2, 3, 4]), (2, [3, 4]), (3, [3, 4])])
+def test_frames_before_one_that_fewer_than_two_cameras_see_stay_lost(by: int, found: list[int]) -> None:
+    assert sorted(tracked_back([1, 2, 3, 4], np.arange(7), unseen_in=2, by=by)) == found
 
 
 def test_no_frame_is_tracked_over_a_gap_or_after_the_end() -> None:

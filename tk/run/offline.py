@@ -31,7 +31,7 @@ from tk.run.second_run import Run, explains_better, track_again, track_back
 from tk.run.task import Task
 from tk.trackers.hypotheses import DROPPED
 from tk.trackers.judgement import FrameEvidence, FrameJudge, depth_known, judge_frames
-from tk.trackers.protocol import Estimate, TwoPassTracker, two_pass, without_cameras
+from tk.trackers.protocol import Estimate, TwoPassTracker, two_pass, usable
 from tk.trackers.reason import Reason, known_sigma, report_frames, status_of
 
 _LOG = logging.getLogger(__name__)
@@ -277,7 +277,7 @@ class _Finisher:
         with open_observations(self.task, lambda _: None, tracker.image_step) as observations:
             for frame, _ in observations.frames(min(rows), max(rows) + 1):
                 if frame.index in rows:
-                    estimate = tracker.step(without_cameras(frame, unused[rows[frame.index]]))
+                    estimate = tracker.step(usable(frame, unused[rows[frame.index]]))
                     found.append(judge.judge(frame.index, estimate).light)
                     self.within(len(found) / len(rows))
         again = draft.copy()

@@ -28,7 +28,7 @@ from tk.run.delays import COMPARED
 from tk.trackers.camera_monitor import CameraMonitor
 from tk.trackers.contour_finder import COARSE_ROWS
 from tk.trackers.judgement import FrameJudge
-from tk.trackers.protocol import Estimate, Frame, TwoPassTracker, shows_person, without_cameras
+from tk.trackers.protocol import Estimate, Frame, TwoPassTracker, shows_person, usable
 from tk.trackers.reason import is_lost
 from tk.trackers.residual import RECENT
 
@@ -209,7 +209,7 @@ def track_back(run: Run, landmarks: Mapping[int, Float], fps: float, false_alarm
                 blank = np.empty((len(masks), 0, 0, 3), np.uint8)
                 frame = Frame(number, blank, masks, landmarks=None if marked is None else marked[None])
                 unused = np.isnan(run.residual[after[0] if lost[row] else row, :, 0])
-                estimate = judge.judge(number, tracker.step(without_cameras(frame, unused)))
+                estimate = judge.judge(number, tracker.step(usable(frame, unused)))
                 if is_lost(estimate.reason):
                     break
                 if lost[row]:

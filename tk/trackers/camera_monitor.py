@@ -43,7 +43,7 @@ from tk.trackers.judgement import (
     all_left_out,
     likelihoods,
 )
-from tk.trackers.protocol import Estimate, Frame, Tracker, shows_person, without_cameras
+from tk.trackers.protocol import Estimate, Frame, Tracker, shows_person, usable, without_cameras
 from tk.trackers.reason import Reason, is_lost
 from tk.trackers.region import RegionTracker
 
@@ -201,9 +201,7 @@ class CameraMonitor(Stateful[MonitorState]):
         if self.tracker.can_exclude_cameras:
             cameras.look(faults)
         out = cameras.states
-        used = without_cameras(frame, out > 0)
-        if np.count_nonzero(shows_person(used.masks)) < 2:
-            used = without_cameras(frame, np.ones(len(out), bool))  # one view does not determine depth
+        used = usable(frame, out > 0)
         if self._region is not None and np.count_nonzero(~cameras.unfit) >= 3:
             estimate, used, torn = self._weigh(self._region, frame, used)
             out = np.where(torn, STATES.index(TORN), out)

@@ -399,3 +399,12 @@ class Stopwatch:
         now = time.perf_counter()
         self.laps[stage] = self.laps.get(stage, 0.0) + now - self._last
         self._last = now
+
+
+def usable(frame: Frame, out: NDArray[np.bool_]) -> Frame:
+    """Return the frame for a tracker that goes without some cameras (C,): with empty masks in all of them if fewer than
+    two others show the subject, because one view does not determine depth."""
+    left = without_cameras(frame, out)
+    if np.count_nonzero(shows_person(left.masks)) < 2:
+        return without_cameras(left, np.ones(len(out), np.bool_))
+    return left
