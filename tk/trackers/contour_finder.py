@@ -26,12 +26,11 @@ from tk.model.body.initial_pose import rough_pose
 from tk.model.body.limb_candidates import Limb, limbs_of
 from tk.model.body.skeleton import JOINTS, build_skeleton, convert_poses
 from tk.model.body.stored_body import body_values
-from tk.model.cameras.bundle import CORRELATION_PX
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.landmark_agreement import consensus
 from tk.model.cameras.tracker_frame import TrackerFrame
 from tk.model.cues import landmarks
-from tk.model.cues.cue import Cue
+from tk.model.cues.cue import CONTOUR_INFORMATION, Cue
 from tk.model.cues.part_colors import PartColors, RenderedBody, color_bins
 from tk.model.cues.ray_costs import Evidence, RayGrid, unpacked
 from tk.model.masks.silhouettes import Pyramid, Views
@@ -51,8 +50,6 @@ Float = NDArray[np.float64]
 # Standard deviation of the logarithm of a stature that was estimated: areas of silhouettes err by 6 %, lengths between
 # landmarks by 2 % about a mean that is 5 % too small.
 ESTIMATED_STATURE_DEVIATION = 0.05
-# Information of one pixel of contour, 1/px²: edgels err by 2 px. The unit of the contours' equations.
-INFORMATION = 1.0 / (2.0**2 * CORRELATION_PX)
 # Rows of the grid of rays: to screen many candidates of a limb, and to choose among few poses.
 COARSE_ROWS, FINE_ROWS = 54, 96
 LINE_SEARCH = SearchSettings()
@@ -348,7 +345,7 @@ class ContourFinder:
             poses: (B, D).
             levels: scales, 0 the finest; None: all.
             images: with images, colour differences attract contours inside the silhouette, too.
-            prior: of the poses, in the units of the contours' equations, see :data:`INFORMATION`.
+            prior: of the poses, in the unit of the contours' equations, see :mod:`tk.model.cues.cue`.
             limb: only this limb moves.
         """
         body = self.body
@@ -374,7 +371,7 @@ class ContourFinder:
             return None
 
         def all_of(poses: Float) -> Quadratic:
-            terms = [cue.normal(poses).scaled(cue.weight / INFORMATION) for cue in cues]
+            terms = [cue.normal(poses).scaled(cue.weight / CONTOUR_INFORMATION) for cue in cues]
             return reduce(add, terms if prior is None else [*terms, prior])
 
         return all_of

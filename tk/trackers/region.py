@@ -35,7 +35,7 @@ from tk.model.body.limb_candidates import Limb, turned
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.cues import landmarks
-from tk.model.cues.cue import Measured, in_frames
+from tk.model.cues.cue import CONTOUR_INFORMATION, Measured, in_frames
 from tk.model.cues.part_colors import LearnedColors, color_bins
 from tk.model.cues.ray_costs import Evidence
 from tk.model.masks.mosaic import doubled
@@ -45,7 +45,7 @@ from tk.model.reduced_images import crop
 from tk.model.setup import Setup, Subject
 from tk.optim.quadratic import Quadratic
 from tk.settings import RegionSettings, Settings, SilhouetteSettings
-from tk.trackers.contour_finder import INFORMATION, Seen
+from tk.trackers.contour_finder import Seen
 from tk.trackers.contour_tracker import ContourTracker
 from tk.trackers.hypotheses import DROPPED, PROPOSED, RENEWAL, SAME_POSE_M, Hypothesis, disagreement, walking
 from tk.trackers.judgement import RECOVER_EVERY, Match, depth_known
@@ -389,7 +389,7 @@ class RegionTracker(ContourTracker[RegionState]):
         deviation = np.where(skeleton.prismatic, TRANSLATION_M, np.radians(angle_deg))
         straight = skeleton.is_straight
         deviation[straight] = skeleton.straight[straight]
-        return Quadratic.about(np.where(straight, 0.0, mean), deviation**-2 / INFORMATION)
+        return Quadratic.about(np.where(straight, 0.0, mean), deviation**-2 / CONTOUR_INFORMATION)
 
     def _rank(self) -> None:
         """Sort the hypotheses by cost; drop those that are improbable beside the best, or equal."""
@@ -502,7 +502,7 @@ class RegionTracker(ContourTracker[RegionState]):
         """
         skeleton, search = self.body.skeleton, self.line_search
         if view_m:
-            search = replace(search, displacement=1.0 / (view_m**2 * INFORMATION))
+            search = replace(search, displacement=1.0 / (view_m**2 * CONTOUR_INFORMATION))
         regions = None if images is None else self.colors.regions(images, self.views.rig.frame_shape)
         here = normal_equations(self.body.arrays, self.views.at(pyramid, 0), poses, search, regions)
         terms = self.terms(pyramid, prior)
@@ -515,7 +515,7 @@ class RegionTracker(ContourTracker[RegionState]):
         pull = self.solver.limit_weight * unit[:, None] * (excess != 0)
         hessian = here.hessian + matrix + pull[:, :, None] * np.eye(poses.shape[1])
         gradient = here.gradient + linear - (matrix @ poses[..., None])[..., 0] + pull * excess
-        return INFORMATION * hessian, INFORMATION * gradient
+        return CONTOUR_INFORMATION * hessian, CONTOUR_INFORMATION * gradient
 
     def variance(self, pose: Float, covariance: Float, residual: Float) -> Float:
         """Return (..., J) variance of the joints' positions along an axis, metres², scaled by the residual.

@@ -24,6 +24,7 @@ from tk.kernels.silhouette import Edgels, find_edgels
 from tk.model.body.body_parameters import BodyFamily
 from tk.model.body.skeleton import SEGMENTS, Skeleton
 from tk.model.cameras.camera import Camera, Rig
+from tk.model.cues.cue import information
 from tk.model.cues.landmarks import NAME as MARKED
 from tk.model.cues.landmarks import LandmarkCue
 from tk.model.masks.silhouettes import Pyramid, Views
@@ -32,11 +33,9 @@ from tk.optim.trajectory import Equations
 Float = NDArray[np.float64]
 
 # Standard deviation of an edgel's distance, pixels: ragged masks, and shapes that no cone has.
-EDGE_NOISE_PX = 3.0
-# Edgels within this length of a contour err together, pixels. Only its product with EDGE_NOISE_PX² counts.
-CORRELATION_PX = 10.0
-# Information of one pixel of contour, 1/px².
-INFORMATION = 1.0 / (EDGE_NOISE_PX**2 * CORRELATION_PX)
+SHAPE_NOISE_PX = 3.0
+#: information of one pixel of contour
+BUNDLE_INFORMATION = information(SHAPE_NOISE_PX)
 # Between samples of a contour, pixels: no more than these are independent, by CORRELATION_PX.
 SPACING_PX = 6.0
 # Standard deviation of a degree of freedom about the given pose, radians or metres; of waist and ankles about zero,
@@ -119,7 +118,7 @@ class ContourBundle:
         frames: Sequence[BundleFrame],
         settings: SearchSettings,
         sigmas: Mapping[str, float],
-        information: float = INFORMATION,
+        information: float = BUNDLE_INFORMATION,
         segment_m: float | None = SEGMENT_M,
     ) -> None:
         """See the attributes.
@@ -128,7 +127,7 @@ class ContourBundle:
             family, rig, frames: as above.
             settings: of the edge search.
             sigmas: standard deviation of each camera parameter that may change; empty if the cameras are known.
-            information: of one pixel of contour, 1/px².
+            information: see :func:`~tk.model.cues.cue.information`.
             segment_m: standard deviation of a segment's position about the skeleton's, metres; None: it is fixed.
         """
         self.family, self.rig, self.frames = family, rig, frames

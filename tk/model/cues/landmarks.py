@@ -64,8 +64,7 @@ LEAST_VISIBLE, LEAST_OVERLAP = 0.2, 0.2
 # Factors of the standard deviations with which a proposal minimises the landmarks' cost, two steps each: a pose that
 # is far away is attracted, too. Largest change of an angle in a step, radians.
 WIDENED, LONGEST_STEP = (16.0, 8.0, 4.0, 2.0, 1.0), 0.6
-# Weight of the landmarks in the contours' equations: these count the edgels of a segment as independent, but clothes
-# and wrong pieces of a mask displace all of them together.
+# Weight of the landmarks in the contours' equations of a frame, see tk.model.cues.cue.
 WEIGHT = 5.0
 # Share of the landmarks' likelihood that counts: a network's errors in neighbouring landmarks go together.
 INDEPENDENT = 0.5
