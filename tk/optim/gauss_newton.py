@@ -22,7 +22,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import ConfigError
 from tk.kernels.newton import NewtonSteps
 from tk.kernels.silhouette import Descent
 from tk.optim.quadratic import Quadratic
@@ -49,21 +48,6 @@ class GaussNewtonSettings:
     # a state's iteration at a scale ends once no parameter changes by more, radians or metres; 0 (the paper): all
     # iterations are made
     tolerance: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.scales <= 5 or not 1 <= self.iterations <= 100:
-            raise ConfigError(
-                f"gauss_newton: scales = {self.scales} must lie in [1, 5], iterations = {self.iterations} in [1, 100]"
-            )
-        if not 0 < self.relaxation < 2:
-            raise ConfigError(f"gauss_newton: relaxation = {self.relaxation} must lie in (0, 2)")
-        weights = self.damping, self.stiffness, self.limit_weight, self.tolerance
-        if not all(value >= 0 for value in weights) or not self.longest_step > 0:
-            raise ConfigError(
-                f"gauss_newton: damping {self.damping}, stiffness {self.stiffness}, limit_weight "
-                f"{self.limit_weight} and tolerance {self.tolerance} must not be negative, longest_step "
-                f"{self.longest_step} must be positive"
-            )
 
     def steps(self, scale: int) -> list[float]:
         """Return the length of each step at a scale as a multiple of the equations' solution."""
