@@ -35,7 +35,7 @@ LENGTH_S, FPS = 16.0, 15.0
 
 def clocks(offsets: Sequence[float] = (0.0, 0.0, 0.0)) -> Clocks:
     count = len(offsets)
-    return Clocks(np.array(offsets), np.ones(count), np.zeros(count), np.zeros(count), np.zeros(count))
+    return Clocks(np.array(offsets), np.ones(count), np.zeros(count), np.zeros(count))
 
 
 def recordings(looks: Sequence[Look]) -> list[Recording]:

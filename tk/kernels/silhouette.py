@@ -325,7 +325,6 @@ class Descent(NamedTuple):
     """B poses after some steps."""
 
     poses: NDArray[np.float64]  # (B, D)
-    hessian: NDArray[np.float64]  # (B, D, D) JᵀWJ before each pose's last step
     steps: NDArray[np.int32]  # (B,) number of steps made
 
 
@@ -337,8 +336,8 @@ def _launch(
     regions: Regions | None,
     newton: NewtonSteps | None = None,
     export: bool = False,
-) -> tuple[Descent, NDArray[np.float64], NDArray[np.floating]]:
-    """Return the poses after the steps; sums (B, 1 + D) and samples before the last step, see the kernel. Without
+) -> tuple[Descent, NormalEquations, NDArray[np.floating]]:
+    """Return the poses after the steps; equations, and samples (see the kernel), before the last step. Without
     ``newton`` the poses stay as they are."""
     ensure_runtime()
     dtype = body.tree.dtype
@@ -366,7 +365,7 @@ def _launch(
         sums,
         hessian,
     )
-    return Descent(state, hessian, sums[:, STEPS].astype(np.int32)), sums, samples
+    return Descent(state, sums[:, STEPS].astype(np.int32)), NormalEquations(hessian, sums[:, GRADIENT:]), samples
 
 
 @functools.cache
@@ -421,8 +420,7 @@ def normal_equations(
     Raises:
         ValueError: the masks are neither of one frame nor of one for each pose.
     """
-    descent, sums, _ = _launch(body, seen, poses, settings, regions)
-    return NormalEquations(descent.hessian, sums[:, GRADIENT:])
+    return _launch(body, seen, poses, settings, regions)[1]
 
 
 def descend(

@@ -59,7 +59,6 @@ class BatchSolution(NamedTuple):
     """Result of :func:`minimise` for B states."""
 
     states: Float  # (B, D) after the last iteration
-    hessian: Float  # (B, D, D) JᵀWJ before the last step
     iterations: NDArray[np.int32]  # (L,) number at each scale, in order
 
 
@@ -87,7 +86,6 @@ def minimise(
     """
     config = config or GaussNewtonSettings()
     states = np.array(start, np.float64)
-    hessian = np.zeros((*states.shape, states.shape[1]))
     index = np.arange(len(lower), dtype=np.int32) if free is None else free.astype(np.int32)
     scales = range(config.scales - 1, -1, -1) if levels is None else levels
     iterations = np.zeros(len(scales), np.int32)
@@ -96,9 +94,9 @@ def minimise(
         linear, matrix = none if terms is None else terms(states)
         rows = np.ascontiguousarray(np.vstack([lower, upper, np.broadcast_to(linear, states.shape)]))
         steps = NewtonSteps(index, rows, np.ascontiguousarray(matrix), _numbers(config, scale == 0))
-        states, hessian, made = descend(states, scale, steps)
+        states, made = descend(states, scale, steps)
         iterations[i] = made.max(initial=0)
-    return BatchSolution(states, hessian, iterations)
+    return BatchSolution(states, iterations)
 
 
 @functools.cache

@@ -305,7 +305,7 @@ def exchanged(
         shared = shared_planes(looks[i], looks[j], rays(i, c), rays(j, d), cameras[c].center, cameras[d].center)
         if shared is None:
             return 0.0
-        profiles = [planes_sum(moved[v], planes) for v, planes in zip((i, j), shared[:2], strict=True)]
+        profiles = [planes_sum(moved[v], planes) for v, planes in zip((i, j), shared, strict=True)]
         one, other = (profile - profile.mean(axis=0) for profile in profiles)
         _, _, z = correlate(one, other, round(SHORTEST_S / _BIN_S))
         return max(float(z[len(other) - 1]), 0.0) ** 2 / 2  # without a lag

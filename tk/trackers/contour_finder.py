@@ -84,14 +84,12 @@ class _Begun:
     Attributes:
         masks: of the frame.
         subject: what was known of the person.
-        average: the average body.
-        rough: (D,) the known rough pose on this body, if any.
+        rough: (D,) the known rough pose on the average body, if any.
         found: what the frame shows.
     """
 
     masks: NDArray[np.uint8]
     subject: Subject
-    average: BodyDimensions
     rough: Float | None
     found: Found
 
@@ -243,7 +241,7 @@ class ContourFinder:
         if init is not None:
             rough = self.settle(pyramid, convert_poses(angles, given, self.body.skeleton)[None]).states[0]
         found = find_in(self, self.see(blind(frame), pyramid=pyramid), rough, alone)
-        return _Begun(frame.masks, subject, average, rough, found)
+        return _Begun(frame.masks, subject, rough, found)
 
     def _adapt(
         self,

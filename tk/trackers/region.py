@@ -227,7 +227,7 @@ class RegionTracker(ContourTracker[RegionState]):
         velocity = np.where(self.body.skeleton.is_by_landmarks, 0.0, contours.prediction)
         starts = np.array([h.pose + velocity * (h.pose - h.previous) for h in self._alive])
         prior = self.prior(starts)
-        poses, _, iterations = self.settle(pyramid, starts, self._scales(), seen.images, prior)
+        poses, iterations = self.settle(pyramid, starts, self._scales(), seen.images, prior)
         watch.lap("optimise")
         mismatch, met = evidence.cast(self.body, poses)
         if not np.isfinite(mismatch).all():
