@@ -15,7 +15,7 @@ from tk.io.results.data import Result, UsedCameras
 from tk.io.results.revision import Revision
 from tk.io.results.status import Status
 from tk.model.body.cone_body import ConeBody
-from tk.model.cameras.bundle import TrackedPoses
+from tk.model.cameras.bundle import TrackedPerson
 from tk.model.cameras.camera import Rig
 from tk.model.cues import landmarks
 from tk.model.cues.cue import Measured, in_frames
@@ -23,7 +23,7 @@ from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
 from tk.people.identity import COLUMNS, doubtful, exchanged, exchanged_masks, report
 from tk.people.people import People
-from tk.run.delays import COMPARED, TrackedPerson, retimed, retimed_measured
+from tk.run.delays import COMPARED, retimed, retimed_measured
 from tk.run.draft import Draft, held, without_absent
 from tk.run.prefetch import open_observations
 from tk.run.refinement import compare_cameras, refine_if_inconsistent
@@ -323,9 +323,7 @@ class _Finisher:
         tracker, masks = draft.tracker_and_masks
         poses = tracker.world.poses_in(draft.current("pose"))
         compared = masks.without(draft.person.monitor.moved)
-        return TrackedPerson(
-            tracker.body, lru_cache(16)(compared.get), TrackedPoses(draft.result.frames, poses, ~draft.lost)
-        )
+        return TrackedPerson(tracker.body, lru_cache(16)(compared.get), draft.result.frames, poses, ~draft.lost)
 
     def _measured(self, draft: Draft, late: NDArray[np.int64]) -> Measured:
         """Return what the first pass has measured in the frames of a draft, in pixels of the cameras in use,

@@ -25,12 +25,12 @@ from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.initial_pose import GREATEST_STATURE, LEAST_STATURE
 from tk.model.body.joints import HIPS, JOINTS, SHOULDERS
 from tk.model.body.limb_candidates import DISTINCT_M
-from tk.model.body.skeleton import Skeleton
+from tk.model.body.skeleton import Skeleton, distinct
 from tk.model.cues import landmarks as landmark_cue
 from tk.model.cues.ray_costs import Evidence
 from tk.model.masks.silhouettes import Pyramid
 from tk.model.setup import AVERAGE_STATURE_M
-from tk.trackers.hypotheses import DROPPED, TrajectoryHypothesis, different, walking
+from tk.trackers.hypotheses import DROPPED, TrajectoryHypothesis, walking
 from tk.trackers.proposals import anywhere, landmarks, opposite
 from tk.trackers.proposals.anywhere import centroid
 
@@ -110,13 +110,8 @@ def find_person(
         new = [pose for _, pose in group if not _contains(skeleton, hypotheses, anchor, pose)]
         hypotheses += _follow(finder, seen, new, anchor)
     hypotheses.sort(key=lambda hypothesis: hypothesis.cost)
-    kept: list[TrajectoryHypothesis] = []
-    for hypothesis in hypotheses:
-        joints = skeleton.joints(hypothesis.poses)
-        apart = [np.max(skeleton.apart(other.poses, joints)) for other in kept]
-        if hypothesis.cost <= hypotheses[0].cost + DROPPED and all(distance > DISTINCT_M for distance in apart):
-            kept.append(hypothesis)
-    return kept
+    hypotheses = [one for one in hypotheses if one.cost <= hypotheses[0].cost + DROPPED]
+    return [hypotheses[i] for i in distinct(skeleton.joints(np.array([one.poses for one in hypotheses])), DISTINCT_M)]
 
 
 def _contains(skeleton: Skeleton, hypotheses: Sequence[TrajectoryHypothesis], frame: int, pose: Float) -> bool:
@@ -154,7 +149,7 @@ def find_in(finder: ContourFinder, seen: Seen, pose: Float | None, alone: bool) 
     found = np.concatenate([anywhere.propose(finder, seen), landmarks.propose(finder, seen)])
     both = [opposite.propose(finder, seen, pose, range(finder.solver.scales)[::-1]) for pose in found[:OPPOSITE]]
     found = np.concatenate([found, *both])
-    found = found[different(skeleton, found, DISTINCT_M)]
+    found = found[distinct(skeleton.joints(found), DISTINCT_M)]
     # A limb search moves limbs only: it brings a pose to where it brings a likelier one with the same trunk. A pose of
     # a single frame gets worse by that.
     before, trunk = seen.evidence.cost(finder.body, found), skeleton.joints(found)[:, TRUNK]
@@ -165,7 +160,7 @@ def find_in(finder: ContourFinder, seen: Seen, pose: Float | None, alone: bool) 
     cost = seen.evidence.cost(finder.body, poses)
     order = np.argsort(cost, kind="stable")
     kept = poses[order[cost[order] < cost.min() + DROPPED]]
-    kept = kept[different(skeleton, kept, DISTINCT_M)]
+    kept = kept[distinct(skeleton.joints(kept), DISTINCT_M)]
     return Found(float(finder.mean_residual(seen.pyramid, kept[:1], seen.frame.uncertain)[0]), kept)
 
 

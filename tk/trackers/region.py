@@ -32,7 +32,7 @@ from tk.kernels.silhouette import normal_equations
 from tk.model.body.body_fit import STATURE_DEVIATION
 from tk.model.body.joint_sigma import CHANGING_M, directions, pose_variance, posture_variance
 from tk.model.body.limb_candidates import Limb, turned
-from tk.model.body.skeleton import JOINTS
+from tk.model.body.skeleton import JOINTS, distinct
 from tk.model.cameras.camera import Rig
 from tk.model.cues import landmarks
 from tk.model.cues.cue import CONTOUR_INFORMATION, Measured, in_frames
@@ -396,16 +396,12 @@ class RegionTracker(ContourTracker[RegionState]):
         if len(self._alive) == 1:
             self._alive = [replace(self._alive[0], age=1)]
             return
-        skeleton = self.body.skeleton
-        kept: list[Hypothesis] = []
-        joints: list[Float] = []
-        for h in sorted(self._alive, key=lambda h: h.cost):
-            if kept and h.cost > kept[0].cost + DROPPED:
-                continue
-            if all(skeleton.apart(h.pose, other) > SAME_POSE_M for other in joints):
-                kept.append(h)
-                joints.append(skeleton.joints(h.pose))
-        self._alive = [replace(kept[0], age=1), *kept[1 : self.config.hypotheses]]
+        ranked = sorted(self._alive, key=lambda h: h.cost)
+        ranked = [h for h in ranked if h.cost <= ranked[0].cost + DROPPED]
+        kept = distinct(
+            self.body.skeleton.joints(np.array([h.pose for h in ranked])), SAME_POSE_M, self.config.hypotheses
+        )
+        self._alive = [replace(ranked[0], age=1), *(ranked[i] for i in kept[1:])]
 
     def misplaced(self, evidence: Evidence, label: NDArray[np.uint8]) -> tuple[Limb, ...]:
         """Return the limbs of which a large part lies outside the mask, or on colours that are not theirs."""

@@ -92,7 +92,7 @@ def camera_agreement(people: Sequence[Filmed], rig: Rig) -> CameraAgreement:
 
     Args:
         people: the bodies, in a world in which z is up, with frames of
-            :func:`tk.model.cameras.bundle.choose_frames`; 20 are enough.
+            :func:`tk.model.cameras.bundle.bundle_frames`; 20 are enough.
         rig: C cameras.
 
     Raises:

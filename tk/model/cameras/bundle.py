@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from tk.kernels.line_search import SearchSettings
 from tk.kernels.silhouette import Edgels, find_edgels
 from tk.model.body.body_parameters import BodyFamily
-from tk.model.body.skeleton import SEGMENTS, Skeleton
+from tk.model.body.cone_body import ConeBody
+from tk.model.body.skeleton import SEGMENTS
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cues.cue import information
 from tk.model.cues.landmarks import NAME as MARKED
@@ -56,9 +57,11 @@ CAMERA_PARAMETERS = {"shift": 2, "turn": 3, "move": 3, "focal": 1, "offset": 1}
 
 
 @dataclass(frozen=True)
-class TrackedPoses:
-    """Poses of a person in some frames of a recording."""
+class TrackedPerson:
+    """A person who was tracked in some frames of a recording, in a world in which z is up."""
 
+    body: ConeBody
+    masks: Callable[[int], NDArray[np.uint8]]  # (C, H, W) of a frame
     frames: NDArray[np.int64]  # (F,) number of each frame, ascending
     poses: Float  # (F, D)
     usable: NDArray[np.bool_]  # (F,) whether the pose is reliable
@@ -297,11 +300,9 @@ def residual_px(contours: Sequence[Contours], count: int) -> Float:
     return np.sqrt(square / np.where(weight > 0, weight, np.nan))
 
 
-def choose_frames(
-    masks: Callable[[int], NDArray[np.uint8]],
+def bundle_frames(
+    person: TrackedPerson,
     views: Views,
-    skeleton: Skeleton,
-    tracked: TrackedPoses,
     count: int,
     scales: int,
     cleaning: bool,
@@ -311,27 +312,25 @@ def choose_frames(
     them.
 
     Args:
-        masks: (C, H, W) of a frame.
+        person: with the frames to choose from.
         views: the C cameras.
-        skeleton: of the body.
-        tracked: the frames to choose from.
         count: largest number of frames.
         scales: of the pyramids.
         cleaning: whether the masks are cleaned first.
         late: (C,) whole frames by which a camera's video is late: its frame k - late goes with frame k of the other
             cameras. None: by none.
     """
-    frames, poses, usable = tracked.frames, tracked.poses, tracked.usable
+    frames, poses, usable = person.frames, person.poses, person.usable
     delays = [0] * len(views.rig) if late is None else late.tolist()
     known = set(frames.tolist())
     inner = np.zeros(len(frames), bool)
     inner[1:-1] = usable[:-2] & usable[1:-1] & usable[2:] & (frames[2:] - frames[:-2] == 2)
     inner &= [all(frame - n in known for n in delays) for frame in frames.tolist()]
     rows = np.flatnonzero(inner)
-    rows = rows[farthest(skeleton.joints(poses[rows]), count)]
+    rows = rows[farthest(person.body.skeleton.joints(poses[rows]), count)]
     chosen = []
     for i in rows:
-        frame_set = np.stack([masks(int(frames[i]) - n)[c] for c, n in enumerate(delays)])
+        frame_set = np.stack([person.masks(int(frames[i]) - n)[c] for c, n in enumerate(delays)])
         velocity = 0.5 * (poses[i + 1] - poses[i - 1])
         chosen.append(BundleFrame(views.pyramid(frame_set, scales, cleaning), poses[i], velocity))
     return chosen
