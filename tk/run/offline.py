@@ -21,7 +21,7 @@ from tk.model.cues import landmarks
 from tk.model.cues.cue import Measured, in_frames
 from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
-from tk.people.identity import COLUMNS, doubtful, exchanged, exchanged_masks, report
+from tk.people.identity import COLUMNS, doubtful, report, unmixed, unmixed_masks
 from tk.people.people import People
 from tk.run.delays import COMPARED, retimed, retimed_measured
 from tk.run.draft import Draft, held, without_absent
@@ -78,7 +78,7 @@ def finish(
     """
     written, contacts = people.written, people.contacts
     kept = [held(result) for result in found]
-    results = exchanged(kept, contacts)
+    results = unmixed(kept, contacts)
     for line in report(contacts):
         note(line)
     drafts = []
@@ -89,7 +89,7 @@ def finish(
             columns = {dataset: getattr(result, name) for dataset, name in COLUMNS.items()}
             draft.columns = {dataset: values for dataset, values in columns.items() if values is not None}
         if masks is not None:
-            draft.masks = exchanged_masks(person.number, contacts, masks, result.frames)
+            draft.masks = unmixed_masks(person.number, contacts, masks, result.frames)
         drafts.append(draft)
     revisions, finisher = {}, _Finisher(task, len(written) == 1, note, within, task.setup.rig, film_again)
     if people.has_segments:
@@ -294,7 +294,7 @@ class _Finisher:
         tracker = drafts[0].tracker_and_masks[0]
         world, people = tracker.world, [self._seen(draft) for draft in drafts]
         agreement = compare_cameras(people, tracker.views)
-        if apart := "" if agreement is None else agreement.contradiction:
+        if apart := "" if agreement is None else agreement.size_contradiction:
             self.note(f"{apart}: all frames are suspect")
             for draft in drafts:
                 draft.unclear = ~draft.lost

@@ -273,7 +273,7 @@ def _bins(look: Look, clocks: Clocks, c: int, begin: float, step: float) -> NDAr
     return np.asarray(np.floor((common - begin) / step), np.int64)
 
 
-def exchanged(
+def exchanged_videos(
     recordings: Sequence[Recording], looks: Sequence[Look], cameras: Sequence[Camera], clocks: Clocks
 ) -> tuple[float, tuple[int, int]] | None:
     """Return the probability that no two videos are exchanged, and the two whose exchange is most probable. None if the

@@ -14,7 +14,7 @@ from tk.model.cameras.camera import Camera
 from tk.synchronise.decide import Decision, decide, timecode_ties
 from tk.synchronise.faults import (
     SURE,
-    exchanged,
+    exchanged_videos,
     other_speed_or_order,
     sound_in_other_order,
     still_parts,
@@ -123,7 +123,7 @@ def synchronise(
     if not clocks.connected[1:].any():  # the first camera may be the wrong one: the others are compared
         clocks = max((solve(count, ties, root) for root in range(count)), key=lambda each: int(each.connected.sum()))
     faulty = other_speed_or_order(recordings, signals, clocks, ties) | faulty
-    if cameras and not faulty and (places := exchanged(recordings, looks, cameras, decision.clocks)):
+    if cameras and not faulty and (places := exchanged_videos(recordings, looks, cameras, decision.clocks)):
         right, (a, b) = places
         if right < 1 - SURE:
             faulty[a] = (

@@ -40,7 +40,7 @@ from tk.optim.gauss_newton import BatchSolution, GaussNewtonSettings
 from tk.optim.quadratic import Quadratic
 from tk.settings import SilhouetteSettings
 from tk.trackers.hypotheses import PROPOSED, SAME_POSE_M, TrajectoryHypothesis, turning
-from tk.trackers.initialisation import MOST_STATURE_RATIO, Found, find_in, find_person, stature_of
+from tk.trackers.initialisation import MOST_STATURE_RATIO, FoundPoses, find_in, find_person, stature_of
 from tk.trackers.proposals import exchanged, limbs
 from tk.trackers.proposals.anywhere import centroid
 from tk.trackers.protocol import Frame
@@ -91,7 +91,7 @@ class _Begun:
     masks: NDArray[np.uint8]
     subject: Subject
     rough: Float | None
-    found: Found
+    found: FoundPoses
 
     def serves(self, frame: Frame, subject: Subject) -> bool:
         """Return whether the same search in a frame would find the same."""
@@ -108,7 +108,7 @@ class ContourFinder:
     Args:
         rig: the cameras.
         up: the upward direction of their world, see :func:`tk.model.cameras.up.up_vector`.
-        config: see :class:`~tk.settings.SilhouetteSettings`.
+        settings: see :class:`~tk.settings.SilhouetteSettings`.
         fps: frames per second.
         line_search: how edges are searched along the contours' normals.
         solver: scales and iterations of Gauss-Newton.
@@ -119,13 +119,13 @@ class ContourFinder:
         self,
         rig: Rig,
         up: str,
-        config: SilhouetteSettings,
+        settings: SilhouetteSettings,
         fps: float = 15.0,
         line_search: SearchSettings = LINE_SEARCH,
         solver: GaussNewtonSettings = SOLVER,
         seed: int = 0,
     ) -> None:
-        self.contours, self.line_search, self.solver = config, line_search, solver
+        self.settings, self.line_search, self.solver = settings, line_search, solver
         self.rig, self.up, self.fps, self.seed = rig, up, fps, seed
         self.world = TrackerFrame.of(rig, up)
         self.views = Views(self.world.rig)
@@ -141,7 +141,7 @@ class ContourFinder:
     @property
     def search_frames(self) -> int:
         """Frames between two routine limb searches; 0: none."""
-        seconds = self.contours.search_every
+        seconds = self.settings.search_every
         return max(int(seconds * self.fps), 1) if seconds else 0
 
     @property
@@ -152,7 +152,7 @@ class ContourFinder:
     @property
     def opening_frames(self) -> int:
         """Number of frames used by the initialisation."""
-        return self.contours.init_frames
+        return self.settings.init_frames
 
     @property
     def body(self) -> ConeBody:
@@ -219,7 +219,7 @@ class ContourFinder:
             begun = self._begin(frames[0], pyramids[0], subject, len(frames) == 1)
         seen = [self.see(blind(f), pyramid=shown) for f, shown in zip(frames, pyramids, strict=True)]
         hypotheses = find_person(self, seen, begun.rough, begun.found)
-        if not self.contours.adapt or subject.body is not None:
+        if not self.settings.adapt or subject.body is not None:
             return np.asarray(hypotheses[0].poses[0])
         expected = BodyDimensions.from_stature(stature or stature_of(self, pyramids, subject.hull_m))
         return self._adapt(frames, pyramids, hypotheses, expected.barefoot, stature is not None)
@@ -323,7 +323,7 @@ class ContourFinder:
             self._cues = of_these, [of(rig, body, measured[name]) for name, of in CUES.items() if name in measured]
         return self._cues[1]
 
-    def contradiction(self, pyramid: Pyramid, poses: Float) -> Float:
+    def cue_variance(self, pyramid: Pyramid, poses: Float) -> Float:
         """Return (B, J) variance of the joints' positions, metres², by which the cues contradict poses (B, D)."""
         return sum((cue.variance(poses) for cue in self.cues(pyramid)), np.zeros((len(poses), len(JOINTS))))
 

@@ -30,6 +30,7 @@ from tk.io.results.status import Status
 from tk.kernels.mask_values import PERSON
 from tk.kernels.silhouette import normal_equations
 from tk.model.body.body_fit import STATURE_DEVIATION
+from tk.model.body.body_parameters import FITTED_STATURE_DEVIATION
 from tk.model.body.joint_sigma import CHANGING_M, directions, pose_variance, posture_variance
 from tk.model.body.limb_candidates import Limb, turned
 from tk.model.body.skeleton import JOINTS, distinct
@@ -55,7 +56,7 @@ from tk.trackers.proposals import opposite as of_heading
 from tk.trackers.protocol import Estimate, Frame, Stopwatch
 from tk.trackers.reason import Reason, is_lost
 from tk.trackers.residual import BaselineState, ResidualBaseline, variance_factor
-from tk.trackers.second_pass import STATURE, SecondPass
+from tk.trackers.second_pass import SecondPass
 
 Float = NDArray[np.float64]
 
@@ -138,13 +139,13 @@ class RegionTracker(ContourTracker[RegionState]):
         self,
         rig: Rig,
         up: str,
-        contours: SilhouetteSettings | None = None,
-        config: RegionSettings | None = None,
+        settings: SilhouetteSettings | None = None,
+        region_settings: RegionSettings | None = None,
         fps: float = 15.0,
         seed: int = 0,
     ) -> None:
-        super().__init__(rig, up, contours or SilhouetteSettings(), fps, seed=seed)
-        self.config = config or RegionSettings()
+        super().__init__(rig, up, settings or SilhouetteSettings(), fps, seed=seed)
+        self.region_settings = region_settings or RegionSettings()
         self._alive: list[Hypothesis] = []
         self._mean_posture: Float = np.zeros((len(JOINTS), 3))
         self._postures = 0
@@ -155,7 +156,7 @@ class RegionTracker(ContourTracker[RegionState]):
 
     def _reset(self) -> None:
         """Forget the residuals and everything that was decided from them."""
-        self.residuals = ResidualBaseline(len(self.rig), self.config.false_alarm)
+        self.residuals = ResidualBaseline(len(self.rig), self.region_settings.false_alarm)
         self._lost_for = self._refused = self._high_for = 0
         self._searched = _NEVER
 
@@ -206,7 +207,7 @@ class RegionTracker(ContourTracker[RegionState]):
             frame = Frame(i, np.empty((len(shown), 0, 0, 3), np.uint8), shown)
             both[i, 1] = self.improved(self.see(frame, pyramid=pyramid), both[i, 1])
         stature = height_m or self.body.dimensions.barefoot
-        deviation = STATURE_DEVIATION if height_m else STATURE
+        deviation = STATURE_DEVIATION if height_m else FITTED_STATURE_DEVIATION
         trackers, costs = (self.with_cameras(self.rig), self.with_cameras(self.rig)), []
         for tracker, one in zip(trackers, both.swapaxes(0, 1), strict=True):
             fitted = self.fit(seen, one, np.arange(len(seen)), stature, deviation)
@@ -216,15 +217,15 @@ class RegionTracker(ContourTracker[RegionState]):
 
     def step(self, frame: Frame) -> Estimate:
         watch = Stopwatch()
-        contours, config = self.contours, self.config
+        settings, own = self.settings, self.region_settings
         frame = self.without_foreign(frame)
-        seen = self.see(frame, frame.images if config.colors else None)
+        seen = self.see(frame, frame.images if own.colors else None)
         pyramid, evidence = seen.pyramid, seen.evidence
         watch.lap("masks_clean")
         # predict, settle
         self._alive += [replace(h, previous=h.pose, jumped=False) for h in self._alive if h.jumped]
         # angles that only landmarks show change when these are seen, not by motion
-        velocity = np.where(self.body.skeleton.is_by_landmarks, 0.0, contours.prediction)
+        velocity = np.where(self.body.skeleton.is_by_landmarks, 0.0, settings.prediction)
         starts = np.array([h.pose + velocity * (h.pose - h.previous) for h in self._alive])
         prior = self.prior(starts)
         poses, iterations = self.settle(pyramid, starts, self._scales(), seen.images, prior)
@@ -267,14 +268,14 @@ class RegionTracker(ContourTracker[RegionState]):
         pose, error = self._best.pose, float(np.nanmean(look.error))
         reason = Match(
             error,
-            contours.lost_error,
+            settings.lost_error,
             excess=self.residuals.mean_excess(look.error),
             cut=cut,
             lost_for=self._lost_for,
             refused=self._refused,
             high_for=self._high_for if self.residuals.high(look.error) else 0,
             depth=bool(depth_known(self.world.rig, self.body.skeleton.joints(pose), look.residual)),
-            false_alarm=config.false_alarm,
+            false_alarm=own.false_alarm,
         ).reason
         if reason != Reason.UNEXPLAINED:
             self._learn(evidence, look)
@@ -330,7 +331,7 @@ class RegionTracker(ContourTracker[RegionState]):
 
         Their pixels become uncertain, because parts of the body may be in front of or behind them.
         """
-        if not (self.config.colors and self.colors.known and frame.images.size):
+        if not (self.region_settings.colors and self.colors.known and frame.images.size):
             return frame
         foreign, grid = self.colors.foreign, self.coarse_grid
         person = grid.sample(frame.masks) >= PERSON
@@ -373,11 +374,11 @@ class RegionTracker(ContourTracker[RegionState]):
         joint may be from its prediction: its last step times the unpredicted share; from the finest of all alone
         Gauss-Newton does not converge. After a jump, a loss or a high residual it is the coarsest.
         """
-        contours, skeleton, solver = self.contours, self.body.skeleton, self.solver
+        settings, skeleton, solver = self.settings, self.body.skeleton, self.solver
         first, window_px = solver.scales - 1, self.line_search.window_px
         if not (self._lost_for or self._high_for or any(h.jumped for h in self._alive)):
             step_m = max(skeleton.apart(h.pose, skeleton.joints(h.previous)) for h in self._alive)
-            error_m = abs(1 - contours.prediction) * step_m
+            error_m = abs(1 - settings.prediction) * step_m
             error_px = error_m * self.views.rig.pixels_per_metre(skeleton.joints(self._best.pose)[0])
             while first > self.search_level and window_px * 2 ** (first - 1) >= error_px:
                 first -= 1
@@ -399,7 +400,7 @@ class RegionTracker(ContourTracker[RegionState]):
         ranked = sorted(self._alive, key=lambda h: h.cost)
         ranked = [h for h in ranked if h.cost <= ranked[0].cost + DROPPED]
         kept = distinct(
-            self.body.skeleton.joints(np.array([h.pose for h in ranked])), SAME_POSE_M, self.config.hypotheses
+            self.body.skeleton.joints(np.array([h.pose for h in ranked])), SAME_POSE_M, self.region_settings.hypotheses
         )
         self._alive = [replace(ranked[0], age=1), *(ranked[i] for i in kept[1:])]
 
@@ -441,7 +442,7 @@ class RegionTracker(ContourTracker[RegionState]):
         """Return whether the person is searched for as at the start, because the last frame was lost, or the residual
         (E_S, (V,)) is above the limit or stays high. Searches for the last reason become rarer: after 3, 6, 12 …
         frames; of a lost person they are in every third frame."""
-        error, limit = float(np.nanmean(by_view)), self.contours.lost_error
+        error, limit = float(np.nanmean(by_view)), self.settings.lost_error
         self._high_for = self._high_for + 1 if self.residuals.high(by_view) else 0
         waits, rest = divmod(self._high_for, RECOVER_EVERY)
         if rest == 0 and waits.bit_count() == 1:
@@ -452,7 +453,7 @@ class RegionTracker(ContourTracker[RegionState]):
         """Update the baseline of the residual; the colours, too, if E_S is not above the baseline. A pixel counts less,
         the more in doubt it is."""
         person, doubt = evidence.person, evidence.doubt
-        if self.config.colors and evidence.bins is not None and self.residuals.mean_excess(look.error) <= 0:
+        if self.region_settings.colors and evidence.bins is not None and self.residuals.mean_excess(look.error) <= 0:
             self.colors.learn(evidence.bins[person], look.label[person], None if doubt is None else 1 - doubt[person])
         self.residuals.learn(look.residual)
 
@@ -472,7 +473,7 @@ class RegionTracker(ContourTracker[RegionState]):
         self._postures += 1
         self._mean_posture += (directions(skeleton, pose) - self._mean_posture) / self._postures
         variance += posture_variance(skeleton, pose, self._mean_posture) + self._spread
-        variance += self.contradiction(seen.pyramid, pose[None])[0]
+        variance += self.cue_variance(seen.pyramid, pose[None])[0]
         if len(self._alive) > 1:
             poses, cost = (np.array(column) for column in zip(*((h.pose, h.cost) for h in self._alive), strict=True))
             variance += disagreement(skeleton, poses, cost)
@@ -556,7 +557,7 @@ class RegionTracker(ContourTracker[RegionState]):
             return poses, residual, np.zeros((len(poses), len(JOINTS)))
         inside = self.world.poses_in(poses)
         again = SecondPass(self, masks, measured or {}, modes, colors, inside, lost, residual, report)
-        if self.contours.adapt and not keep_body:
+        if self.settings.adapt and not keep_body:
             again.fit_body(height_m)
         again.settle()
         again.decide()
@@ -583,7 +584,7 @@ class RegionTracker(ContourTracker[RegionState]):
 
     def with_cameras(self, rig: Rig) -> RegionTracker:
         """Return a tracker of the same body and colours with other cameras."""
-        fresh = RegionTracker(rig, self.up, self.contours, self.config, self.fps, self.seed)
+        fresh = RegionTracker(rig, self.up, self.settings, self.region_settings, self.fps, self.seed)
         fresh.take_body(self.body)
         fresh.view_m = self.view_m
         fresh.colors.state = self.colors.state

@@ -16,7 +16,7 @@ from tk.kernels.cones import CONE
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_parameters import BodyFamily, shapes_of
 from tk.model.body.cone_body import SHAPE_NUMBERS, build_cone_body, group_of
-from tk.model.cameras.agreement import CAMERA_SEARCH, camera_agreement
+from tk.model.cameras.agreement import camera_agreement
 from tk.model.cameras.bundle import TrackedPerson, bundle_frames, camera_rows, farthest
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import closest_to_lines
@@ -171,7 +171,7 @@ def test_body_family_begins_at_the_body():
     ellipsoid = [group_of(p.name) for p in BODY.parts if p.kind != CONE]
     change[[BODY.shape_groups.index(name) for name in ellipsoid], 2] = 0.0  # nothing tapers there
     np.testing.assert_allclose(shapes_of(body), change, atol=2e-4)
-    family = BodyFamily.around(body, 0.03)
+    family = BodyFamily.around(body)
     again = family.build(family.start)
     for one, other in zip(again.parts, body.parts, strict=True):
         np.testing.assert_allclose(one.shape, other.shape, rtol=2e-3)
@@ -266,7 +266,7 @@ def test_two_cameras_of_which_one_is_turned_sideways_contradict_each_other(turne
     poses = motion().copy()
     poses[:, [BODY.skeleton.names.index(f"torso_{axis}") for axis in "xyz"]] += np.array(met) - place
     seen = bundle_frames(tracked(in_time(), poses), Views(wrong), FRAMES, SCALES, True)
-    contradiction = camera_agreement([(BODY, seen)], wrong).contradiction
+    contradiction = camera_agreement([(BODY, seen)], wrong).size_contradiction
     assert ("larger than" in contradiction) == (turned_deg != 0), contradiction
 
 
@@ -287,9 +287,7 @@ def test_cameras_are_refined_from_all_people():
     seen = frames(in_time(), PERTURBED)
     people = [(BODY, seen[:4]), (build_cone_body(BodyDimensions.from_stature(1.6)), seen[4:])]
     sigmas = {"turn": 0.01, "move": 0.01}
-    both, *alone = (
-        PeopleBundle(some, 0.03, PERTURBED, CAMERA_SEARCH, sigmas) for some in (people, people[:1], people[1:])
-    )
+    both, *alone = (PeopleBundle(some, PERTURBED, sigmas) for some in (people, people[:1], people[1:]))
     found, *parts = (bundle.linearise(bundle.start, 1).reduced() for bundle in (both, *alone))
     own = both.cameras
     prior = np.diag(np.tile(both.sigma**-2.0, len(RIG)))

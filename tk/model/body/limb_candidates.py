@@ -96,7 +96,7 @@ def pairs(limbs: Sequence[Limb]) -> list[tuple[Limb, ...]]:
     return [tuple(pair) for pair in kinds if len(pair) == 2]
 
 
-def exchanged(poses: Float, both: Sequence[tuple[Limb, ...]]) -> Float:
+def exchanged_limbs(poses: Float, both: Sequence[tuple[Limb, ...]]) -> Float:
     """Return poses (N, ..., D), one for each of N pairs of limbs: poses (..., D) with their joints at each other's
     places as nearly as the limits allow.
 

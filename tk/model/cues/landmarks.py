@@ -32,7 +32,7 @@ from tk.kernels.mask_values import PERSON
 from tk.model.body.anthropometry import AVERAGE_BODY
 from tk.model.body.body_points import LANDMARKS, POINTS, SEGMENT
 from tk.model.body.cone_body import ConeBody
-from tk.model.body.initial_pose import figures
+from tk.model.body.initial_pose import resting_figures
 from tk.model.body.joints import HIPS, JOINTS, SHOULDERS, side_of
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.triangulation import triangulate_joints
@@ -284,7 +284,7 @@ def propose(rig: Rig, body: ConeBody, seen: Float, p_near: Float) -> Float:
     point (3,), by Gauss-Newton, at first with wide distributions.
     """
     skeleton = body.skeleton
-    start = figures(skeleton, p_near)
+    start = resting_figures(skeleton, p_near)
     prior = Quadratic.about(start, np.where(skeleton.prismatic, 1.0, np.pi) ** -2.0)
     poses, cue = start, LandmarkCue(rig, body, seen)
     for factor in WIDENED:

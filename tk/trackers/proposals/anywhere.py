@@ -41,7 +41,7 @@ def propose(finder: ContourFinder, seen: Seen, pose: Float | None = None) -> Flo
     skeleton, pyramid = finder.body.skeleton, seen.pyramid
     p_centroid = centroid(finder.views.rig, pyramid, seen.frame.index)
     yaw = skeleton.index("torso_yaw")
-    poses = gait.figures(skeleton, HEADINGS, PHASES, p_centroid, 0.0 if pose is None else pose[yaw])
+    poses = gait.gait_figures(skeleton, HEADINGS, PHASES, p_centroid, 0.0 if pose is None else pose[yaw])
     if pose is not None:
         moved = pose.copy()
         moved[skeleton.prismatic] = p_centroid
