@@ -24,7 +24,7 @@ import numpy as np
 
 from tk.io.captures.capture import open_capture
 from tk.io.results.reader import read_joints
-from tk.model.body.limb_candidates import exchanged, pairs, turned
+from tk.model.body.limb_candidates import exchanged_limbs, pairs, turned
 from tk.run.plan import recording_task
 from tk.run.session import estimates
 from tk.run.task import RecordingOptions
@@ -56,7 +56,7 @@ def choices(tracker: RegionTracker, frame: Frame, views: Sequence[int], truth: n
 
     if off(pose).max() > RIGHT_M:
         return
-    arms, legs = exchanged(pose, pairs(tracker.limbs))
+    arms, legs = exchanged_limbs(pose, pairs(tracker.limbs))
     wrong = [("arms exchanged", arms), ("legs exchanged", legs), ("opposite heading", turned(pose, tracker.limbs))]
     rng = np.random.default_rng(frame.index)
     for limb in tracker.limbs:

@@ -11,7 +11,6 @@ from scipy.spatial import ConvexHull
 
 from tests.model.figures import BODY, draw_silhouettes, scaled, surface_points
 from tests.model.ring import ring_of_cameras
-from tk.errors import ConfigError
 from tk.kernels import silhouette
 from tk.kernels.cone_arrays import PART_MOVED
 from tk.kernels.cones import CONE, ELLIPSOID, END_FAR, END_NEAR, OUTLINE, SIDE_A, SIDE_B, curve_of, enter, point_on
@@ -206,7 +205,6 @@ def test_equations_are_the_sums_of_the_edgels_rows():
     total = equations_of(BODY, MASKS, moved[None], PLAIN)
     np.testing.assert_allclose(total.hessian[0], rows.T @ (edgels.weight[:, None] * rows), rtol=1e-9, atol=1e-6)
     np.testing.assert_allclose(total.gradient[0], rows.T @ (edgels.weight * edgels.distance), rtol=1e-9, atol=1e-6)
-    assert 0 < total.found[0] <= 1
 
 
 def test_displacements_of_a_segment_in_a_view_are_eliminated():
@@ -249,14 +247,13 @@ def test_descent_is_single_steps_one_after_another():
     two = STEPS._replace(numbers=STEPS.numbers[:-1])
     whole, poses = descent_of(MASKS, start, two), start
     for length in two.numbers[LENGTHS:]:
-        before = poses
         one = STEPS._replace(numbers=np.append(STEPS.numbers[:LENGTHS], length))
-        poses = descent_of(MASKS, before, one).poses
+        poses = descent_of(MASKS, poses, one).poses
     np.testing.assert_array_equal(whole.poses, poses)
     np.testing.assert_array_equal(whole.steps, 2)
-    np.testing.assert_allclose(whole.hessian, equations_of(BODY, MASKS, before, PLAIN).hessian, rtol=1e-9, atol=1e-6)
-    cost = [equations_of(BODY, MASKS, each, PLAIN).cost for each in (start, whole.poses)]
-    assert (cost[1] < 0.7 * cost[0]).all()
+    off = [edgels_of(BODY, MASKS, pose, PLAIN).distance for poses in (start, whole.poses) for pose in poses]
+    square = np.array([np.mean(np.minimum(np.abs(one), 8.0) ** 2) for one in off]).reshape(2, -1)
+    assert (square[1] < 0.7 * square[0]).all()
 
 
 def test_step_solves_the_damped_equations():
@@ -415,7 +412,7 @@ def test_a_body_that_no_camera_sees_has_no_equations():
     away = POSE.copy()
     away[2] += 50
     total = equations_of(BODY, MASKS, away[None], SearchSettings())
-    assert np.isinf(total.cost[0]) and total.found[0] == 0 and not total.hessian.any()
+    assert not total.hessian.any() and not total.gradient.any()
 
 
 def test_drawn_silhouettes_are_the_hulls_of_the_parts():
@@ -520,8 +517,3 @@ def test_equal_colors_give_no_border():
     # one colour that suits one group only: the border is not on the line
     assert border(plain, two_colors(), (30, 30), (1.0, 0.0))[1] > 6
     assert border(np.full((60, 60, 3), BLUE, np.uint8), two_colors(), (30, 30), (1.0, 0.0))[1] < -6
-
-
-def test_settings_out_of_range_are_refused():
-    with pytest.raises(ConfigError, match="window_px = 0"):
-        SearchSettings(window_px=0)

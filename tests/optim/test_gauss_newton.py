@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tk.errors import ConfigError
 from tk.kernels.newton import LENGTHS, LINEAR, TOLERANCE, newton_step
 from tk.kernels.runtime import ensure_runtime, ti
 from tk.kernels.silhouette import Descent
@@ -45,7 +44,7 @@ def solve(equations, start, free=ALL, lower=NONE[0], upper=NONE[1], config=None,
 
     def descend(states, scale, steps):
         states, rows = states.copy(), np.arange(len(states))
-        hessian, made = np.zeros((*states.shape, 4)), np.zeros(len(states), np.int32)
+        made = np.zeros(len(states), np.int32)
         for length in steps.numbers[LENGTHS:]:
             moved, change, scratch = states[rows], np.zeros(len(rows)), np.zeros((len(rows), 4, 5))
             here = equations(moved.copy(), scale, rows)
@@ -53,12 +52,12 @@ def solve(equations, start, free=ALL, lower=NONE[0], upper=NONE[1], config=None,
             matrix = steps.matrix[rows] if len(steps.matrix) > 1 else steps.matrix
             numbers = steps.free, terms, matrix, steps.numbers, length
             _step_kernel(*numbers, here.hessian, here.gradient, scratch, moved, change)
-            states[rows], hessian[rows] = moved, here.hessian
+            states[rows] = moved
             made[rows] += 1
             rows = rows[change > steps.numbers[TOLERANCE]]
             if not len(rows):
                 break
-        return Descent(states, hessian, made)
+        return Descent(states, made)
 
     return gauss_newton.minimise(descend, start, free, lower, upper, config, terms, levels)
 
@@ -158,9 +157,8 @@ def test_scales_run_from_coarse_to_fine():
     minimise(watched, start, ALL, *NONE, config)
     assert seen == [2, 2, 1, 1, 0, 0]
     seen.clear()
-    found = solve(watched, start, ALL, *NONE, config, levels=(1,))
+    solve(watched, start, ALL, *NONE, config, levels=(1,))
     assert seen == [1, 1]
-    np.testing.assert_allclose(found.hessian, np.repeat((A.T @ A)[None], len(start), 0))
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 0.05])
@@ -264,17 +262,3 @@ def test_prior_determines_parameters_without_evidence():
     config = GaussNewtonSettings(scales=1, iterations=8, longest_step=9)
     found = minimise(linear(A, y), start, ALL, *NONE, config, prior)
     np.testing.assert_allclose(found[:, 2], 0.3, atol=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"scales": 0}, "scales = 0"),
-        ({"iterations": 0}, "iterations = 0"),
-        ({"damping": -1.0}, "damping -1"),
-        ({"relaxation": 2.0}, "relaxation = 2"),
-    ],
-)
-def test_settings_out_of_range_are_refused(values, message):
-    with pytest.raises(ConfigError, match=message):
-        GaussNewtonSettings(**values)

@@ -79,7 +79,8 @@ def test_step_and_covariances_equal_the_dense_solution(seed, damping, coupled):
     np.testing.assert_allclose(np.concatenate([own.ravel(), shared]), expected, atol=1e-9)
     inverse = np.linalg.inv(H)
     np.testing.assert_allclose(np.linalg.inv(reduced.hessian), inverse[-SHARED:, -SHARED:], atol=1e-9)
-    for b, covariance in enumerate(reduced.covariance()):
+    own = reduced.chain.covariance + reduced.response @ np.linalg.inv(reduced.hessian) @ reduced.response.swapaxes(1, 2)
+    for b, covariance in enumerate(own):
         own_block = slice(b * OWN, (b + 1) * OWN)
         np.testing.assert_allclose(covariance, inverse[own_block, own_block], atol=1e-9)
 
@@ -107,7 +108,7 @@ def walk(frames, seen, step=0.1):
 def test_frames_without_evidence_lie_between_their_neighbours_and_are_less_sure():
     found = walk(9, [0, 1, 7, 8], step=1.0)
     np.testing.assert_allclose(np.diff(found.plain[1:8, 0]), found.plain[2, 0] - found.plain[1, 0])
-    deviation = np.sqrt(found.covariance()[:, 0, 0])
+    deviation = np.sqrt(found.chain.covariance[:, 0, 0])
     assert deviation.argmax() == 4
     assert deviation[4] == pytest.approx(np.sqrt((3.0 + deviation_of_a_side() ** 2) / 2))
 

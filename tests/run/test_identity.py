@@ -23,10 +23,10 @@ from tk.people.identity import (
     Contact,
     Contacts,
     doubtful,
-    exchanged,
-    exchanged_masks,
     outcome_of,
     report,
+    unmixed,
+    unmixed_masks,
 )
 
 AT = np.zeros((2, 3))
@@ -95,14 +95,14 @@ def test_likeness_is_zero_for_the_colours_that_were_learned() -> None:
     assert colors.likeness(np.full(100, COLOR_BINS - 1, np.int32)) < -3
 
 
-def test_frames_of_people_who_were_mixed_up_are_exchanged(people: tuple[Result, ...]) -> None:
+def test_frames_of_people_who_were_mixed_up_are_unmixed(people: tuple[Result, ...]) -> None:
     contact = Contact((0, 1), 3, 9, 7, AT, outcome=EXCHANGED)
-    first, second = exchanged(people, [contact])
+    first, second = unmixed(people, [contact])
     inside = (people[0].frames >= 7) & (people[0].frames <= 9)
     np.testing.assert_array_equal(first.joints[~inside], people[0].joints[~inside])
     np.testing.assert_array_equal(first.joints[inside], people[1].joints[inside])
     np.testing.assert_array_equal(second.status[inside], people[0].status[inside])
-    assert exchanged(people, [Contact((0, 1), 3, 9, 7, AT, outcome=KEPT)]) == people
+    assert unmixed(people, [Contact((0, 1), 3, 9, 7, AT, outcome=KEPT)]) == people
     assert report([contact]) == ["people 0 and 1 were mixed up in frame 7; this is undone"]
 
 
@@ -121,7 +121,7 @@ def test_masks_are_exchanged_too(tmp_path: Path) -> None:
             store.put(frame, np.full((2, 3, 4), 255 * n, np.uint8))
     contact = Contact((0, 1), 1, 2, 1, AT, outcome=EXCHANGED)
     for _ in range(2):  # an interrupted run is finished again: the stores stay as they are
-        mine, others = (exchanged_masks(n, [contact], dict(enumerate(stores)), np.arange(4)) for n in (0, 1))
+        mine, others = (unmixed_masks(n, [contact], dict(enumerate(stores)), np.arange(4)) for n in (0, 1))
         assert [int(mine.get(frame).max()) for frame in range(4)] == [0, 255, 255, 0]
         assert [int(others.get(frame).max()) for frame in range(4)] == [255, 0, 0, 255]
-    assert exchanged_masks(0, [], dict(enumerate(stores)), np.arange(4)) is stores[0]
+    assert unmixed_masks(0, [], dict(enumerate(stores)), np.arange(4)) is stores[0]

@@ -26,11 +26,11 @@ from tk.io.captures.mask_store import MaskStore
 from tk.io.results.reader import read_joints, read_result
 from tk.io.results.status import Status
 from tk.kernels.mask_values import OTHERS
-from tk.model.cameras.bundle import TrackedPoses
+from tk.model.cameras.bundle import TrackedPerson
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.refinement import turn_between
 from tk.run import offline as finish
-from tk.run.delays import TrackedPerson, retimed, retimed_measured, whole_delays
+from tk.run.delays import retimed, retimed_measured, whole_delays
 from tk.run.draft import Draft
 from tk.run.refined_calibration import refine_capture
 from tk.run.refinement import BetterCameras
@@ -111,7 +111,7 @@ def test_cameras_that_were_moved_are_not_compared(tiny: Path, tmp_path: Path, mo
 
     def compare(people: list[TrackedPerson], *_: Any) -> None:
         (person,) = people
-        seen.append(np.array([person.masks(frame).any(axis=(1, 2)) for frame in person.tracked.frames.tolist()]))
+        seen.append(np.array([person.masks(frame).any(axis=(1, 2)) for frame in person.frames.tolist()]))
 
     monkeypatch.setattr(finish, "compare_cameras", compare)
     monkeypatch.setattr(CameraMonitor, "moved", np.array([False, True, False, False]))
@@ -198,9 +198,8 @@ def test_videos_that_are_late_by_more_than_edges_reach_are_found(late: list[int]
     drawn[:, 3, ::3] = 0  # this camera's masks are poor
     drawn[away] = 0
     seen = np.array([[drawn[min(max(k + n, 0), 23), c] for c, n in enumerate(late)] for k in frames])
-    tracked = TrackedPoses(frames, poses, seen.any(axis=(2, 3)).all(axis=1))
-    found = whole_delays([TrackedPerson(BODY, seen.__getitem__, tracked)], RIG)
-    assert found.tolist() == late
+    tracked = TrackedPerson(BODY, seen.__getitem__, frames, poses, seen.any(axis=(2, 3)).all(axis=1))
+    assert whole_delays([tracked], RIG).tolist() == late
 
 
 @pytest.mark.parametrize(("count", "found"), [(56, [0, 12, 0, 0]), (24, [0, 0, 0, 0])])
@@ -210,8 +209,8 @@ def test_delay_at_the_edge_of_the_range_is_searched_farther_and_never_taken(coun
     poses = stroll(0.03 * frames - 0.8, 31)
     drawn = draw_silhouettes(BODY, RIG, poses)
     seen = np.array([[drawn[min(k + n, count - 1), c] for c, n in enumerate((0, 12, 0, 0))] for k in frames])
-    tracked = TrackedPoses(frames, poses, np.ones(count, np.bool_))
-    assert whole_delays([TrackedPerson(BODY, seen.__getitem__, tracked)], RIG).tolist() == found
+    tracked = TrackedPerson(BODY, seen.__getitem__, frames, poses, np.ones(count, np.bool_))
+    assert whole_delays([tracked], RIG).tolist() == found
 
 
 def test_an_excluded_camera_is_not_late() -> None:
@@ -222,9 +221,8 @@ def test_an_excluded_camera_is_not_late() -> None:
     aside = np.roll(seen[24:, 1], 50, axis=2)  # the camera is turned
     seen[24:, 1] = np.where(aside > 0, OTHERS, 0)
     seen[24:, 1, 50:54, 70:74] = 255
-    tracked = TrackedPoses(frames, poses, np.ones(40, np.bool_))
-    found = whole_delays([TrackedPerson(BODY, seen.__getitem__, tracked)], RIG)
-    assert found.tolist() == [0, 0, 0, 0]
+    tracked = TrackedPerson(BODY, seen.__getitem__, frames, poses, np.ones(40, np.bool_))
+    assert whole_delays([tracked], RIG).tolist() == [0, 0, 0, 0]
 
 
 def test_masks_of_late_cameras_come_from_other_frames() -> None:

@@ -78,9 +78,9 @@ def test_table_names_values_errors_and_range() -> None:
 def test_constant_and_numbers_derived_from_it_change_in_a_process_of_its_own() -> None:
     code = (
         "import scripts.sensitivity, tk.model.cameras.bundle as b; import tk.model.body.body_fit as f; "
-        "print(b.EDGE_NOISE_PX, b.INFORMATION, f.INFORMATION)"
+        "print(b.SHAPE_NOISE_PX, b.BUNDLE_INFORMATION, f.BUNDLE_INFORMATION)"
     )
-    name = "tk.model.cameras.bundle:EDGE_NOISE_PX"
+    name = "tk.model.cameras.bundle:SHAPE_NOISE_PX"
     ran = subprocess.run(
         [sys.executable, "-c", code],
         env={**os.environ, sensitivity._VARIABLE: json.dumps({name: 2.0})},
@@ -90,7 +90,7 @@ def test_constant_and_numbers_derived_from_it_change_in_a_process_of_its_own() -
     )
     from tk.model.cameras import bundle
 
-    expected = [2 * bundle.EDGE_NOISE_PX, bundle.INFORMATION / 4, bundle.INFORMATION / 4]
+    expected = [2 * bundle.SHAPE_NOISE_PX, bundle.BUNDLE_INFORMATION / 4, bundle.BUNDLE_INFORMATION / 4]
     assert [float(value) for value in ran.stdout.split()] == pytest.approx(expected)
 
 

@@ -17,7 +17,7 @@ from tests.synchronise.test_command import write
 from tests.synchronise.test_sound import steps
 from tk.synchronise.faults import (
     SURE,
-    exchanged,
+    exchanged_videos,
     other_speed_or_order,
     sound_in_other_order,
     still_parts,
@@ -35,7 +35,7 @@ LENGTH_S, FPS = 16.0, 15.0
 
 def clocks(offsets: Sequence[float] = (0.0, 0.0, 0.0)) -> Clocks:
     count = len(offsets)
-    return Clocks(np.array(offsets), np.ones(count), np.zeros(count), np.zeros(count), np.zeros(count))
+    return Clocks(np.array(offsets), np.ones(count), np.zeros(count), np.zeros(count))
 
 
 def recordings(looks: Sequence[Look]) -> list[Recording]:
@@ -139,18 +139,18 @@ def test_picture_that_freezes_is_named(looks: list[Look]) -> None:
 def test_exchanged_videos_are_named() -> None:
     looks = [watch(camera, [wander(0)], 0.0, 8.0, FPS, seed=c) for c, camera in enumerate(ring(4))]
     zero = clocks((0.0,) * 4)
-    right = exchanged(recordings(looks), looks, ring(4), zero)
+    right = exchanged_videos(recordings(looks), looks, ring(4), zero)
     assert right is not None and right[0] > SURE
     turned = [looks[0], looks[3], looks[2], looks[1]]
-    wrong = exchanged(recordings(turned), turned, ring(4), zero)
+    wrong = exchanged_videos(recordings(turned), turned, ring(4), zero)
     assert wrong is not None and wrong[0] < 1 - SURE and wrong[1] == (1, 3)
     other = [recordings(turned)[0], replace(recordings(turned)[1], width=90)]
-    assert exchanged(other, turned[:2], ring(4)[:2], clocks((0.0, 0.0))) is None  # images of another size
+    assert exchanged_videos(other, turned[:2], ring(4)[:2], clocks((0.0, 0.0))) is None  # images of another size
 
 
 def test_exchange_is_open_where_nothing_moves() -> None:
     looks = [watch(camera, [], 0.0, 8.0, FPS, seed=c) for c, camera in enumerate(ring(3))]
-    found = exchanged(recordings(looks), looks, ring(3), clocks())
+    found = exchanged_videos(recordings(looks), looks, ring(3), clocks())
     assert found is not None and 1 - SURE < found[0] < SURE
 
 

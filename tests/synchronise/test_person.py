@@ -91,7 +91,7 @@ def test_unequal_lights_are_not_matched() -> None:
 
 def clocks(count: int) -> Clocks:
     zero = np.zeros(count)
-    return Clocks(zero, zero + 1, zero, zero, zero)
+    return Clocks(zero, zero + 1, zero, zero)
 
 
 @pytest.mark.parametrize("there", [False, True])

@@ -128,7 +128,7 @@ def test_poses_with_similar_costs_in_one_frame_all_become_hypotheses(monkeypatch
     frames = [Frame(i, np.zeros(0, np.uint8), m) for i, m in enumerate(masks)]
     tracker = tracker_of()
     monkeypatch.setattr(
-        tracker, "settle", lambda _, starts, *__: BatchSolution(np.array(starts), np.zeros(0), np.zeros(3, np.int32))
+        tracker, "settle", lambda _, starts, *__: BatchSolution(np.array(starts), np.zeros(3, np.int32))
     )
     starts = tracker.world.poses_in(np.array([wrong, *3 * [right]]))
     monkeypatch.setattr("tk.trackers.proposals.anywhere.gait.figures", lambda *_: starts)
@@ -236,9 +236,7 @@ def test_heading_as_before_is_preferred_where_silhouettes_are_ambiguous(monkeypa
     tracker = tracker_of()
     before, other = (placed(standing_pose(SKELETON), yaw) for yaw in (0.4, 0.4 + np.pi))
     seen = tracker.see(Frame(0, np.zeros(0, np.uint8), draw_silhouettes(BODY, RIG, before[None])[0]))
-    monkeypatch.setattr(
-        tracker, "settle", lambda _, starts, *__: BatchSolution(starts, np.zeros(0), np.zeros(1, np.int32))
-    )
+    monkeypatch.setattr(tracker, "settle", lambda _, starts, *__: BatchSolution(starts, np.zeros(1, np.int32)))
     yaw = SKELETON.index("torso_yaw")
 
     class Gains:

@@ -15,7 +15,7 @@ from tk.errors import CaptureError
 from tk.model.body.cone_body import COLOR_GROUPS, ConeBody, build_cone_body
 from tk.model.body.gait_poses import standing_pose, walking_pose
 from tk.model.body.joint_sigma import pose_variance
-from tk.model.body.limb_candidates import Limb, exchanged, pairs
+from tk.model.body.limb_candidates import Limb, exchanged_limbs, pairs
 from tk.model.body.skeleton import JOINTS, shoulder_angles
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume
@@ -25,7 +25,7 @@ from tk.settings import RegionSettings, Settings, SilhouetteSettings
 from tk.trackers import second_pass
 from tk.trackers.judgement import UNKNOWN_AFTER
 from tk.trackers.proposals import anywhere, limbs
-from tk.trackers.proposals import exchanged as exchanged_limbs
+from tk.trackers.proposals import exchanged as of_exchanged
 from tk.trackers.reason import Reason
 from tk.trackers.region import RegionTracker
 from tk.trackers.residual import LEAST_SPREAD
@@ -61,18 +61,18 @@ def tracker_at(
     pose: np.ndarray,
     masks: np.ndarray = MASKS[0],
     body: ConeBody = BODY,
-    contours: SilhouetteSettings = SETTINGS,
-    config: RegionSettings | None = None,
+    settings: SilhouetteSettings = SETTINGS,
+    region_settings: RegionSettings | None = None,
     images: np.ndarray = EMPTY,
 ) -> RegionTracker:
     """A tracker of this body that starts near a pose."""
-    tracker = RegionTracker(RIG, "z", contours, config)
+    tracker = RegionTracker(RIG, "z", settings, region_settings)
     tracker.start([observe(masks, 0, images)], Subject(init=init_of(pose), body=body))
     return tracker
 
 
 def test_walk_is_tracked_and_a_resumed_run_is_the_same() -> None:
-    tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=0.2))
+    tracker = tracker_at(POSES[0], settings=replace(SETTINGS, search_every=0.2))
     estimates = []
     for i, masks in enumerate(MASKS):
         estimates.append(tracker.step(observe(masks, i)))
@@ -81,7 +81,7 @@ def test_walk_is_tracked_and_a_resumed_run_is_the_same() -> None:
             state = tracker.state
     assert [e.status for e in estimates] == ["initialised"] + ["tracked"] * 5
     assert max(errors(e, p).mean() for e, p in zip(estimates, POSES, strict=True)) < CLOSE_M
-    second = RegionTracker(RIG, "z", tracker.contours, tracker.config)
+    second = RegionTracker(RIG, "z", tracker.settings, tracker.region_settings)
     second.take_model(model)
     second.state = state
     for i in range(3, 6):
@@ -125,7 +125,7 @@ def test_limb_search_finds_an_arm_that_has_jumped() -> None:
     for every in (0, 1):
         # without the search the arm stays in its old pose
         config = RegionSettings(false_alarm=0.4 if every else 1e-9)
-        tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=every / 15), config=config)
+        tracker = tracker_at(POSES[0], settings=replace(SETTINGS, search_every=every / 15), region_settings=config)
         tracker.step(observe(MASKS[0]))
         for i in range(1, 4):
             found[every] = tracker.step(observe(masks[i], i))
@@ -146,7 +146,7 @@ def test_seed_draws_the_candidates_of_the_limb_search(monkeypatch: pytest.Monkey
     monkeypatch.setattr(Limb, "candidates", watched)
     every = []
     for seed in (0, 0, 1):
-        tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=1 / 15))
+        tracker = tracker_at(POSES[0], settings=replace(SETTINGS, search_every=1 / 15))
         tracker.seed = seed
         drawn.clear()  # `tracker_at` searches with the default
         limbs.modes(tracker, tracker.see(observe(MASKS[0], 1)), tracker.last_poses()[0], tracker.limbs)
@@ -205,7 +205,7 @@ def test_run_resumed_after_a_jump_is_the_same() -> None:
     first.step(observe(MASKS[0]))
     jumped = first.step(observe(masks[0], 1))
     assert jumped.iterations[1] == 1 and any(h.jumped for h in first._alive)
-    second = RegionTracker(RIG, "z", first.contours, first.config)
+    second = RegionTracker(RIG, "z", first.settings, first.region_settings)
     second.take_model(first.model())
     second.state = first.state
     a, b = (tracker.step(observe(masks[1], 2)) for tracker in (first, second))
@@ -288,7 +288,7 @@ def test_person_is_searched_for_if_the_residual_stays_high(monkeypatch: pytest.M
         return searches[-1]
 
     monkeypatch.setattr(anywhere, "propose", watched)
-    for module in (limbs, exchanged_limbs):
+    for module in (limbs, of_exchanged):
         monkeypatch.setattr(module, "propose", lambda *_: none)
     monkeypatch.setattr(tracker.residuals, "jumped", lambda _: False)  # as if it had risen slowly
     tracker.state = replace(state, alive=[replace(state.alive[0], pose=wrong, previous=wrong)])
@@ -506,9 +506,9 @@ def test_a_person_who_stands_still_is_seen_once_a_second() -> None:
 
 
 def test_second_pass_finds_legs_that_were_exchanged_in_most_frames() -> None:
-    tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=1 / 3))
+    tracker = tracker_at(POSES[0], settings=replace(SETTINGS, search_every=1 / 3))
     legs = pairs(tracker.limbs)[1]
-    first = np.array([exchanged(pose, [legs])[0] for pose in POSES[:4]] + list(POSES[4:]))
+    first = np.array([exchanged_limbs(pose, [legs])[0] for pose in POSES[:4]] + list(POSES[4:]))
     masks = draw_silhouettes(BODY, RIG, POSES)
     poses, _, sigma = tracker.second_pass(masks, first, np.zeros(6, bool), np.zeros((6, 3, 2)), None, keep_body=True)
     moved = [joint for leg in legs for joint in leg.joints]
@@ -551,9 +551,9 @@ def test_legs_that_took_each_other_s_place_are_found_by_the_routine_search() -> 
     pose = POSES[0]
     off = {}
     for every in (0.0, 0.3):
-        tracker = tracker_at(pose, contours=replace(SETTINGS, search_every=every))
+        tracker = tracker_at(pose, settings=replace(SETTINGS, search_every=every))
         _, legs = pairs(tracker.limbs)
-        tracker.start_at(exchanged(pose, [legs])[0])
+        tracker.start_at(exchanged_limbs(pose, [legs])[0])
         moved = [joint for leg in legs for joint in leg.joints]
         off[every] = errors(tracker.step(observe(MASKS[0], 1)), pose)[moved].max()
     assert off[0.0] > 0.2  # a descent alone does not exchange them
@@ -561,7 +561,7 @@ def test_legs_that_took_each_other_s_place_are_found_by_the_routine_search() -> 
 
 
 def test_routine_search_runs_at_intervals() -> None:
-    tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=1 / 3))
+    tracker = tracker_at(POSES[0], settings=replace(SETTINGS, search_every=1 / 3))
     searched = [bool(tracker.step(observe(MASKS[0], i)).iterations[1]) for i in range(7)]
     assert np.flatnonzero(searched).tolist() == [0, 5]
 

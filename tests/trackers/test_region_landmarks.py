@@ -20,7 +20,7 @@ from tests.trackers.test_region import (
     with_arm,
 )
 from tests.trackers.walker import BODY, NAMES, errors, observe
-from tk.model.body.limb_candidates import exchanged, pairs, turned
+from tk.model.body.limb_candidates import exchanged_limbs, pairs, turned
 from tk.model.body.skeleton import JOINTS
 from tk.model.cues.landmarks import NAME
 from tk.model.cues.landmarks import points as landmark_places
@@ -36,7 +36,7 @@ def test_landmarks_correct_left_and_right(wrong: str) -> None:
     """Silhouettes alone keep a person who was tracked back to front, or with exchanged legs."""
     pose = POSES[2]
     tracker = tracker_at(pose)
-    mistaken = turned(pose, tracker.limbs) if wrong == "turned" else exchanged(pose, pairs(tracker.limbs))[1]
+    mistaken = turned(pose, tracker.limbs) if wrong == "turned" else exchanged_limbs(pose, pairs(tracker.limbs))[1]
     for landmarks, right in ((None, False), (seen_at(pose), True)):
         tracker.start_at(mistaken)
         found = tracker.step(replace(observe(MASKS[2], 0), landmarks=landmarks))
@@ -111,7 +111,7 @@ def test_estimate_has_the_landmarks_of_its_person() -> None:
 def test_second_pass_ignores_landmarks_of_excluded_cameras() -> None:
     tracker, residual = tracker_at(POSES[0]), np.zeros((3, 3, 2))
     residual[:, 2] = np.nan
-    wrong = np.stack([exchanged(pose, pairs(tracker.limbs))[1] for pose in POSES[:3]])
+    wrong = np.stack([exchanged_limbs(pose, pairs(tracker.limbs))[1] for pose in POSES[:3]])
     spoilt = np.stack([seen_at(pose)[0] for pose in POSES[:3]])
     spoilt[:, 2, :, :2] += 20.0
     plain = spoilt.copy()
@@ -141,8 +141,8 @@ def test_second_pass_interpolates_the_turn_of_the_head_between_frames_with_landm
 
 def test_second_pass_corrects_legs_by_landmarks_of_all_cameras() -> None:
     """Legs that are exchanged in all frames: no other frame shows them right."""
-    tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=0.1))
-    wrong = np.stack([exchanged(pose, pairs(tracker.limbs))[1] for pose in POSES])
+    tracker = tracker_at(POSES[0], settings=replace(SETTINGS, search_every=0.1))
+    wrong = np.stack([exchanged_limbs(pose, pairs(tracker.limbs))[1] for pose in POSES])
     marked = {NAME: np.stack([seen_at(pose)[0] for pose in POSES])}
     found, _, _ = tracker.second_pass(
         MASKS, wrong, np.zeros(6, bool), np.zeros((6, 3, 2)), None, marked, keep_body=True
@@ -180,7 +180,7 @@ def test_network_is_asked_where_the_frame_leaves_a_limb_open() -> None:
     masks = draw_silhouettes(BODY, RIG, pose[None])[0]
     network, found = Network(pose), {}
     for name, ask in (("silhouettes", None), ("network", network)):
-        tracker = tracker_at(pose, masks, contours=replace(SETTINGS, search_every=0.2))
+        tracker = tracker_at(pose, masks, settings=replace(SETTINGS, search_every=0.2))
         found[name] = [tracker.step(replace(observe(masks, i), ask=ask)) for i in range(3)]
     assert network.asked == 1  # where the limbs are searched for
     shown = landmark_places(BODY, pose)
@@ -194,7 +194,7 @@ def test_network_is_not_asked_where_the_frame_shows_all_limbs() -> None:
     """The silhouettes show both arms and both legs."""
     pose = with_arm(with_arm(POSES[0], "l", (0.0, 1.0, 0.0), 5.0), "r", (0.0, 1.0, 0.0), 5.0)
     masks, network = draw_silhouettes(BODY, RIG, pose[None])[0], Network(pose)
-    tracker = tracker_at(pose, masks, contours=replace(SETTINGS, search_every=0.2))
+    tracker = tracker_at(pose, masks, settings=replace(SETTINGS, search_every=0.2))
     tracker.step(observe(masks, 0))
     found = [tracker.step(replace(observe(masks, i), ask=network)) for i in range(1, 4)]
     assert [int(e.iterations[1]) for e in found] == [0, 0, 1]  # the limbs were searched for
@@ -205,7 +205,7 @@ def test_answer_about_somebody_else_is_not_used() -> None:
     pose = with_arm(POSES[0], "l", (0.8, -0.2, -0.6), 70.0)
     masks, elsewhere = draw_silhouettes(BODY, RIG, pose[None])[0], pose.copy()
     elsewhere[0] += 2.0
-    tracker, other = (tracker_at(pose, masks, contours=replace(SETTINGS, search_every=0.2)) for _ in range(2))
+    tracker, other = (tracker_at(pose, masks, settings=replace(SETTINGS, search_every=0.2)) for _ in range(2))
     network = Network(elsewhere)
     found = tracker.step(replace(observe(masks, 0), ask=network))
     assert network.asked == 1 and found.landmarks is None

@@ -55,7 +55,7 @@ def test_a_walk_is_tracked_and_resumed_bit_for_bit():
             model, state = dict(tracker.model()), tracker.state
     assert [e.status for e in estimates] == ["initialised"] + ["tracked"] * 5
     assert max(errors(e, p).mean() for e, p in zip(estimates, POSES, strict=True)) < CLOSE_M
-    second = SilhouetteTracker(RIG, "z", tracker.contours)
+    second = SilhouetteTracker(RIG, "z", tracker.settings)
     second.take_model(model)
     second.state = state
     for i in range(3, 6):

@@ -25,10 +25,10 @@ from tk.io.captures.capture import Capture, open_capture
 from tk.io.captures.session import inherited
 from tk.io.results.data import Result
 from tk.io.results.reader import as_damage_error, read_result, read_truth
+from tk.kernels.mask_values import PERSON
 from tk.model.body.joints import ANKLE_JOINTS, JOINTS
 from tk.model.cameras.camera import Rig
-from tk.model.cues.ray_costs import RayGrid
-from tk.model.masks.silhouettes import share_wrong
+from tk.model.cues.ray_costs import RayGrid, residual_of
 from tk.trackers.bodies import body_and_poses
 
 Float = NDArray[np.float64]
@@ -172,8 +172,8 @@ def _silhouette_errors(result: Result, capture: Capture) -> tuple[list[float] | 
         for frame in frames:
             row = row_of.get(frame.index)
             if row is not None and frame.masks is not None and np.isfinite(result.pose[row]).all():
-                drawn = grid.render(body, poses[row][None]).label[0] > 0
-                errors.append(share_wrong(np.where(drawn, np.uint8(255), np.uint8(0)), frame.masks))
+                label = grid.render(body, poses[row][None]).label[0]
+                errors.append(residual_of(label > 0, grid.sample(frame.masks) >= PERSON).sum(axis=1))
     values = np.array(errors).reshape(-1, len(capture.rig))
     seen = np.isfinite(values)  # NaN for an empty mask
     if not seen.any(axis=0).all():

@@ -28,7 +28,7 @@ from tk.model.cameras.common_view import sample_box, views_of
 from tk.model.cameras.up import shown, up_vector
 from tk.model.cameras.volume import Volume
 from tk.model.hull.coarse import Hull
-from tk.model.masks.image_health import MOST_SHIFT, ImageHealth, Sampled, contradiction, sampled
+from tk.model.masks.image_health import MOST_SHIFT, ImageHealth, Sampled, mask_contradiction, sampled
 from tk.model.masks.image_shift import shift_between
 from tk.model.masks.mask_agreement import INCONSISTENT, Agreement, MaskAgreement
 from tk.model.masks.regions import clean_by_area
@@ -78,7 +78,7 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
     notes, small, masks = read.notes, read.small, read.masks
     pairs = [(i + s, i + s + REACH) for i in centers for s in (-REACH, 0)]
     given = [(small[i], small[k]) for i, k in pairs if capture.has_masks and i in small and k in small]
-    unrelated = contradiction(given)
+    unrelated = mask_contradiction(given)
     compare = MaskAgreement(capture.rig, capture.volume)
     people, entered = read.watch.people(), read.watch.entered or 0
     if (later := frames >= entered).any():  # before it the masks show nobody, or people outside the volume

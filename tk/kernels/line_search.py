@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import ConfigError
 from tk.kernels.mask_values import OTHERS
 from tk.kernels.runtime import ti
 
@@ -24,12 +23,7 @@ _ALIKE_PIXELS = 3.0
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """Settings of the search along normals.
-
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
+    """Settings of the search along normals."""
 
     window_px: float = 8.0  # search range along the normal, in pixels of the scale (the paper: typically 8)
     # distance between samples, in pixels of the scale (the paper: typically every pixel; with three, joints differ by
@@ -52,23 +46,6 @@ class SearchSettings:
     # precision about zero of the displacement of a segment's contours in one view, which the equations then contain as
     # an unknown; in their unit, pixels of contour times square pixels a square metre. 0: contours are not displaced
     displacement: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name, value, valid, expected in (
-            ("window_px", self.window_px, 1 <= self.window_px <= 64, "in [1, 64]"),
-            ("spacing_px", self.spacing_px, 0.25 <= self.spacing_px <= 32, "in [0.25, 32]"),
-            ("most_samples", self.most_samples, 2 <= self.most_samples <= 1024, "in [2, 1024]"),
-            ("ambiguous_px", self.ambiguous_px, 0 <= self.ambiguous_px <= 64, "in [0, 64]"),
-            ("tangential", self.tangential, 0 <= self.tangential <= 1, "in [0, 1]"),
-            ("robust_px", self.robust_px, 0 <= self.robust_px <= 1000, "in [0, 1000]"),
-        ):
-            if not valid:
-                raise ConfigError(f"silhouette search: {name} = {value} must lie {expected}")
-
-    @property
-    def lost_px(self) -> float:
-        """Cost, as a distance, of a sample without an edge. It only affects the comparison of poses."""
-        return 2 * self.window_px
 
 
 class Regions(NamedTuple):

@@ -50,11 +50,10 @@ from tk.kernels.wrench import (
 _EXPORT = 13
 # Columns of the packed settings. SCALE: pixels of the full picture in one of this scale; the others: SearchSettings.
 (
-    SCALE, WINDOW, SPACING, AMBIGUOUS, TANGENTIAL, ROBUST, LOST,
-    DISPLACED, COLORS, MOST_SAMPLES, INTERIOR, EXPORT, RATIO,
-) = range(13)  # fmt: skip
-# Columns of ``sums``: cost, weight of the samples that found an edge, weight of all, steps made; then the gradient.
-COST, FOUND, ALL, STEPS, GRADIENT = range(5)
+    SCALE, WINDOW, SPACING, AMBIGUOUS, TANGENTIAL, ROBUST, DISPLACED, COLORS, MOST_SAMPLES, INTERIOR, EXPORT, RATIO,
+) = range(12)  # fmt: skip
+# Columns of ``sums``: steps made; then the gradient.
+STEPS, GRADIENT = range(2)
 
 
 class Silhouettes(NamedTuple):
@@ -73,9 +72,6 @@ class NormalEquations(NamedTuple):
 
     hessian: NDArray[np.float64]  # (B, D, D) JᵀWJ
     gradient: NDArray[np.float64]  # (B, D) JᵀWd: the step solves `hessian @ step = gradient`
-    # (B,) weighted mean square distance; a sample without an edge counts as `lost_px`; inf without samples
-    cost: NDArray[np.float64]
-    found: NDArray[np.float64]  # (B,) weight of the samples that found an edge, as a share of all samples
 
 
 class Edgels(NamedTuple):
@@ -155,9 +151,8 @@ def export_sample(samples: ti.template(), c: int, i: int, x_unscaled, pixel, g, 
 def prepare_pose(
     tree: ti.template(), parts: ti.template(), curves: ti.template(), cameras: ti.template(), pose: ti.template(),
     b: int, joints: ti.template(), placed: ti.template(), hiders: ti.template(), outlines: ti.template(),
-    sums: ti.template(),
 ):  # fmt: skip
-    """Place the body of pose b, trace its contours in every view, and set its sums to 0; arguments as in the kernel."""
+    """Place the body of pose b, and trace its contours in every view; arguments as in the kernel."""
     V, Q = cameras.shape[0], curves.shape[0]
     forward_tree(tree, pose, b, b, joints)
     place_parts(joints, parts, b, placed)
@@ -165,8 +160,6 @@ def prepare_pose(
     for task in range(V * Q):
         v, q = task // Q, task % Q
         trace_curve(parts, placed, cameras, b, v, curves[q, 0], curves[q, 1], b * V * Q + task, outlines)
-    for i in range(GRADIENT):
-        sums[b, i] = 0.0
     for k in range(tree.shape[0]):
         for i in range(2 * VIEW_NUMBERS):
             joints[b, k, INERTIA + i] = 0.0
@@ -197,7 +190,7 @@ def search_contours(
     parts: ti.template(), curves: ti.template(), cameras: ti.template(), size: ti.template(), mask: ti.template(),
     frame: int, image: ti.template(), likelihood: ti.template(), numbers: ti.template(), b: int, origin,
     joints: ti.template(), placed: ti.template(), hiders: ti.template(), outlines: ti.template(),
-    samples: ti.template(), sums: ti.template(),
+    samples: ti.template(),
 ):  # fmt: skip
     """Sum the rows of all edgels of pose b, which :func:`prepare_pose` has placed; arguments as in the kernel."""
     V, Q = cameras.shape[0], curves.shape[0]
@@ -205,7 +198,6 @@ def search_contours(
         c, v, q = b * V * Q + task, task // Q, task % Q
         p, kind = curves[q, 0], curves[q, 1]
         scale, window, most_samples = numbers[SCALE], numbers[WINDOW], ti.cast(numbers[MOST_SAMPLES], ti.i32)
-        cost, met, all_samples = 0.0 * scale, 0.0 * scale, 0.0 * scale
         pull = ti.Vector([0.0 * scale for _ in range(PULL_NUMBERS)])
         inertia = ti.Vector([0.0 * scale for _ in range(INERTIA_NUMBERS)])
         if numbers[EXPORT] == 1.0:
@@ -245,24 +237,15 @@ def search_contours(
                 elif use:
                     found, d = search_mask(mask, frame * V + v, width, height, at, n, window)
                     d *= scale
-                    if found >= 0:
-                        all_samples += share
-                    if found == 0:
-                        cost += share * numbers[LOST] * numbers[LOST]
-                    elif found > 0:
+                    if found > 0:
                         at_edgel = pixel + d * n
                         weight = weigh_edgel(parts, curves, outlines, numbers, c - q, p, at_edgel, n, d, share)
-                        cost += share * ti.min(d * d, numbers[LOST] * numbers[LOST])
-                        met += share
                 if found > 0 and weight > 0.0:
                     add_row(pull, inertia, x - origin, J, n, d, weight, numbers[TANGENTIAL])
                     if numbers[EXPORT] == 1.0:
                         at_unit = unscaled(kind, shape, x_part)
                         export_sample(samples, c, i, at_unit, pixel, pulled(J, n), n, d, weight)
         # always in the same order: the same sums every time
-        sums[b, COST] = sums[b, COST] + cost
-        sums[b, FOUND] = sums[b, FOUND] + met
-        sums[b, ALL] = sums[b, ALL] + all_samples
         k = ti.cast(parts[p, PART_MOVED], ti.i32)
         into = OF_VIEW if numbers[DISPLACED] > 0.0 else INERTIA
         for a in ti.static(range(INERTIA_NUMBERS)):
@@ -289,7 +272,7 @@ def _descent_kernel(real):
         image: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (V, H, W, 3) of the full picture
         likelihood: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (G, COLOR_BINS)
         # settings
-        numbers: ti.types.ndarray(dtype=real, ndim=1),  # (13,) from SCALE to RATIO
+        numbers: ti.types.ndarray(dtype=real, ndim=1),  # (12,) from SCALE to RATIO
         free: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (n,) this and the next three: :class:`NewtonSteps`
         terms: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (2 + B, D)
         matrix: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (B, D, D) or (1, D, D)
@@ -306,7 +289,7 @@ def _descent_kernel(real):
         factor: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (B, n, n + 1)
         # out
         samples: ti.types.ndarray(dtype=real, ndim=3),  # (B V Q, most_samples, _EXPORT), if EXPORT
-        sums: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (B, 4 + D) see COST, before the last step
+        sums: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (B, 1 + D) see STEPS, before the last step
         hessian: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (B, D, D) likewise; zeroed by the caller
     ):
         # one thread handles a pose from end to end; a variant without threads costs 0.4 s to compile and saves nothing
@@ -319,11 +302,11 @@ def _descent_kernel(real):
             while moves:
                 for k in range(tree.shape[0]):
                     pose[b, k] = ti.cast(state[b, k], real)
-                prepare_pose(tree, parts, curves, cameras, pose, b, joints, placed, hiders, outlines, sums)
+                prepare_pose(tree, parts, curves, cameras, pose, b, joints, placed, hiders, outlines)
                 origin = load_translation(placed, b, 0)
                 search_contours(
                     parts, curves, cameras, size, mask, frame, image, likelihood, numbers, b, origin, joints, placed,
-                    hiders, outlines, samples, sums,
+                    hiders, outlines, samples,
                 )  # fmt: skip
                 collect_pulls(tree, b, joints, origin, sums, GRADIENT)
                 collect_inertias(tree, b, joints, origin, hessian)
@@ -342,7 +325,6 @@ class Descent(NamedTuple):
     """B poses after some steps."""
 
     poses: NDArray[np.float64]  # (B, D)
-    hessian: NDArray[np.float64]  # (B, D, D) JᵀWJ before each pose's last step
     steps: NDArray[np.int32]  # (B,) number of steps made
 
 
@@ -354,8 +336,8 @@ def _launch(
     regions: Regions | None,
     newton: NewtonSteps | None = None,
     export: bool = False,
-) -> tuple[Descent, NDArray[np.float64], NDArray[np.floating]]:
-    """Return the poses after the steps; sums (B, 4 + D) and samples before the last step, see the kernel. Without
+) -> tuple[Descent, NormalEquations, NDArray[np.floating]]:
+    """Return the poses after the steps; equations, and samples (see the kernel), before the last step. Without
     ``newton`` the poses stay as they are."""
     ensure_runtime()
     dtype = body.tree.dtype
@@ -383,7 +365,7 @@ def _launch(
         sums,
         hessian,
     )
-    return Descent(state, hessian, sums[:, STEPS].astype(np.int32)), sums, samples
+    return Descent(state, sums[:, STEPS].astype(np.int32)), NormalEquations(hessian, sums[:, GRADIENT:]), samples
 
 
 @functools.cache
@@ -398,7 +380,7 @@ def _numbers(
     s: SearchSettings, scale: float, weight: float, step: int, export: bool, dtype: np.dtype
 ) -> NDArray[np.floating]:
     """Pack the settings in the order from SCALE to RATIO."""
-    pixels = scale, s.window_px, s.spacing_px, s.ambiguous_px, s.tangential, s.robust_px, s.lost_px, s.displacement
+    pixels = scale, s.window_px, s.spacing_px, s.ambiguous_px, s.tangential, s.robust_px, s.displacement
     return np.array((*pixels, weight, s.most_samples, s.interior, export, 1 / step), dtype)
 
 
@@ -438,16 +420,7 @@ def normal_equations(
     Raises:
         ValueError: the masks are neither of one frame nor of one for each pose.
     """
-    descent, sums, _ = _launch(body, seen, poses, settings, regions)
-    weight = sums[:, ALL]
-    known = weight > 0
-    safe = np.where(known, weight, 1.0)
-    return NormalEquations(
-        hessian=descent.hessian,
-        gradient=sums[:, GRADIENT:],
-        cost=np.where(known, sums[:, COST] / safe, np.inf),
-        found=np.where(known, sums[:, FOUND] / safe, 0.0),
-    )
+    return _launch(body, seen, poses, settings, regions)[1]
 
 
 def descend(

@@ -22,7 +22,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import ConfigError
 from tk.kernels.newton import NewtonSteps
 from tk.kernels.silhouette import Descent
 from tk.optim.quadratic import Quadratic
@@ -50,21 +49,6 @@ class GaussNewtonSettings:
     # iterations are made
     tolerance: float = 0.0
 
-    def __post_init__(self) -> None:
-        if not 1 <= self.scales <= 5 or not 1 <= self.iterations <= 100:
-            raise ConfigError(
-                f"gauss_newton: scales = {self.scales} must lie in [1, 5], iterations = {self.iterations} in [1, 100]"
-            )
-        if not 0 < self.relaxation < 2:
-            raise ConfigError(f"gauss_newton: relaxation = {self.relaxation} must lie in (0, 2)")
-        weights = self.damping, self.stiffness, self.limit_weight, self.tolerance
-        if not all(value >= 0 for value in weights) or not self.longest_step > 0:
-            raise ConfigError(
-                f"gauss_newton: damping {self.damping}, stiffness {self.stiffness}, limit_weight "
-                f"{self.limit_weight} and tolerance {self.tolerance} must not be negative, longest_step "
-                f"{self.longest_step} must be positive"
-            )
-
     def steps(self, scale: int) -> list[float]:
         """Return the length of each step at a scale as a multiple of the equations' solution."""
         plain = [1.0] if scale == 0 and self.relaxation > 1 else []
@@ -75,7 +59,6 @@ class BatchSolution(NamedTuple):
     """Result of :func:`minimise` for B states."""
 
     states: Float  # (B, D) after the last iteration
-    hessian: Float  # (B, D, D) JᵀWJ before the last step
     iterations: NDArray[np.int32]  # (L,) number at each scale, in order
 
 
@@ -103,7 +86,6 @@ def minimise(
     """
     config = config or GaussNewtonSettings()
     states = np.array(start, np.float64)
-    hessian = np.zeros((*states.shape, states.shape[1]))
     index = np.arange(len(lower), dtype=np.int32) if free is None else free.astype(np.int32)
     scales = range(config.scales - 1, -1, -1) if levels is None else levels
     iterations = np.zeros(len(scales), np.int32)
@@ -112,9 +94,9 @@ def minimise(
         linear, matrix = none if terms is None else terms(states)
         rows = np.ascontiguousarray(np.vstack([lower, upper, np.broadcast_to(linear, states.shape)]))
         steps = NewtonSteps(index, rows, np.ascontiguousarray(matrix), _numbers(config, scale == 0))
-        states, hessian, made = descend(states, scale, steps)
+        states, made = descend(states, scale, steps)
         iterations[i] = made.max(initial=0)
-    return BatchSolution(states, hessian, iterations)
+    return BatchSolution(states, iterations)
 
 
 @functools.cache

@@ -183,10 +183,6 @@ class Reduced:
         shared = np.asarray(np.linalg.solve(self.hessian, self.gradient), np.float64)
         return self.plain - self.response @ shared, shared
 
-    def covariance(self) -> Float:
-        """Return (B, D, D) the covariance of each block, the uncertainty of the shared unknowns included."""
-        return self.chain.covariance + self.response @ np.linalg.inv(self.hessian) @ self.response.swapaxes(1, 2)
-
 
 @dataclass(frozen=True)
 class Solution(Generic[T]):

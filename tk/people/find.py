@@ -29,6 +29,7 @@ from tk.model.cameras.volume import Volume, VoxelGrid
 from tk.model.hull.coarse import Voxels, dilated
 from tk.model.hull.voxel_table import VoxelTable
 from tk.model.masks.sightings import BEYOND_M
+from tk.model.reduced_images import every
 from tk.people.columns import MOST, HullColumns, Near
 
 Float = NDArray[np.float64]
@@ -212,8 +213,7 @@ class PeopleFinder:
         """
         half = np.abs(self._to_plan.T @ (_HALF_M, _HALF_M, _HALF_HEIGHT_M))
         near = self._grid.within(position - half, position + half)
-        offset = self._step // 2
-        small = masks[:, offset :: self._step, offset :: self._step].reshape(len(masks), -1)
+        small = every(masks, masks.shape[1:], self._step).reshape(len(masks), -1)
         _, voxels = self._table.voxels(near)
         values, sees = np.take_along_axis(small, voxels.pixels, axis=1), voxels.sees
         empty, shown = (values == 0) & sees, ((values >= PERSON) & sees).sum(axis=0) >= 2
@@ -287,8 +287,7 @@ class PeopleFinder:
 
     def _reduced(self, masks: NDArray) -> Bool:
         """Return masks in reduced images (C, h, w)."""
-        offset = self._step // 2
-        return np.asarray(masks[:, offset :: self._step, offset :: self._step] > 0)
+        return np.asarray(every(masks, masks.shape[1:], self._step) > 0)
 
     def _sighted(self, landmarks: Float | None) -> list[tuple[Float, float]]:
         """Return the trunks (3,) of the people on whose landmarks, of (N, C, L, 4), two images agree, metres, with no

@@ -22,19 +22,15 @@ Float = NDArray[np.float64]
 _MIXED = 2.0
 
 
-def owners_by_hulls(
-    rig: Rig, grid: RayGrid, people: Sequence[LocatedPerson], frame: Frame, sighted: Sequence[RenderedBody] = ()
-) -> PixelOwners:
+def owners_by_hulls(rig: Rig, grid: RayGrid, people: Sequence[LocatedPerson], frame: Frame) -> PixelOwners:
     """Return the owner of each pixel of a frame in which people were found.
 
     Args:
         rig, grid: the cameras, and their rays.
         people: in the frame.
         frame: its masks may have the value :data:`~tk.kernels.mask_values.OTHERS`.
-        sighted: bodies that landmarks in the frame show.
     """
-    hulls = [cast_points(rig, grid, person.points, person.voxel_m) for person in people]
-    return assign(rig, grid, _in_place(sighted, hulls), frame)
+    return assign(rig, grid, [cast_points(rig, grid, person.points, person.voxel_m) for person in people], frame)
 
 
 def shares_by_hulls(

@@ -146,7 +146,7 @@ def outcome_of(likeness: Float, shorter_m: float) -> int:
     return UNCLEAR if shorter_m > -CONTACT_M else KEPT
 
 
-def exchanged(people: Sequence[Result], contacts: Sequence[Contact]) -> tuple[Result, ...]:
+def unmixed(people: Sequence[Result], contacts: Sequence[Contact]) -> tuple[Result, ...]:
     """Return the people with the frames exchanged that the contacts name; lengths of the people do not change."""
     found = list(people)
     for contact in contacts:
@@ -182,10 +182,10 @@ def report(contacts: Sequence[Contact]) -> list[str]:
     return lines
 
 
-def exchanged_masks(
+def unmixed_masks(
     person: int, contacts: Sequence[Contact], masks: MaskStores | Mapping[int, MaskStore], frames: NDArray[np.int64]
 ) -> MaskStore:
-    """Return a person's masks of frames (F,), those that :func:`exchanged` exchanges taken from the other person; the
+    """Return a person's masks of frames (F,), those that :func:`unmixed` exchanges taken from the other person; the
     stores stay as they are."""
     mixed = [c for c in contacts if c.outcome == EXCHANGED]
     if not any(person in contact.people for contact in mixed):

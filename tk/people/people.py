@@ -30,7 +30,7 @@ from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.body.body_fit import INFORMATIVE_FRAMES
 from tk.model.cues.part_colors import RenderedBody
 from tk.model.cues.ray_costs import RayGrid
-from tk.model.masks.image_health import contradiction, sampled
+from tk.model.masks.image_health import mask_contradiction, sampled
 from tk.model.setup import Setup, Subject
 from tk.people.choose import chosen, in_order, matched, unknown_subject
 from tk.people.find import LocatedPerson, PeopleFinder
@@ -183,7 +183,7 @@ class People:
             raise ConfigError(f"the method {self._first.method} tracks one person who is alone in view")
         try:
             compared = spread_over(opening) if given_masks else ()
-            if reason := contradiction(pairwise(sampled(f.images, f.masks) for f in compared)):
+            if reason := mask_contradiction(pairwise(sampled(f.images, f.masks) for f in compared)):
                 raise CaptureError(reason)
             self._start(opening, found, numbers)
         except CaptureError as error:

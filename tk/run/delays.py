@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cache, lru_cache
 
 import numpy as np
@@ -11,8 +10,7 @@ from numpy.typing import NDArray
 
 from tk.io.captures.mask_store import MaskStore
 from tk.kernels.mask_values import OTHERS, PERSON
-from tk.model.body.cone_body import ConeBody
-from tk.model.cameras.bundle import TrackedPoses
+from tk.model.cameras.bundle import TrackedPerson
 from tk.model.cameras.camera import Rig
 from tk.model.cues.ray_costs import RayGrid, residual_of
 from tk.trackers.contour_finder import COARSE_ROWS
@@ -26,15 +24,6 @@ REACH, MOST = 5, 80
 _MENDED = 0.8
 # Least share of wrong pixels that is compared, a tenth of what correct cameras have: drawn masks have none.
 _EXACT = 0.01
-
-
-@dataclass(frozen=True)
-class TrackedPerson:
-    """A person who was tracked: the body, the masks, and the poses, in a world in which z is up."""
-
-    body: ConeBody
-    masks: Callable[[int], NDArray[np.uint8]]  # (C, H, W) of a frame
-    tracked: TrackedPoses
 
 
 def whole_delays(people: Sequence[TrackedPerson], rig: Rig) -> NDArray[np.int64]:
@@ -61,16 +50,15 @@ def whole_delays(people: Sequence[TrackedPerson], rig: Rig) -> NDArray[np.int64]
 def _shares_by_delay(person: TrackedPerson, grid: RayGrid, count: int) -> Callable[[range], NDArray[np.float64]]:
     """Return a function from N delays to the shares (N, R, C) of wrong pixels in R frames, at most ``count``, of which
     all masks with these delays are stored."""
-    tracked = person.tracked
-    frames, stored = tracked.frames, set(tracked.frames.tolist())
+    frames, stored = person.frames, set(person.frames.tolist())
     sampled = cache(lambda frame: grid.sample(person.masks(frame)).copy())
 
     @cache
     def body_in(i: int) -> NDArray[np.bool_]:
-        return np.asarray(grid.render(person.body, tracked.poses[i][None]).label[0] > 0)
+        return np.asarray(grid.render(person.body, person.poses[i][None]).label[0] > 0)
 
     def shares(delays: range) -> NDArray[np.float64]:
-        rows = np.flatnonzero(tracked.usable & [all(frame - n in stored for n in delays) for frame in frames.tolist()])
+        rows = np.flatnonzero(person.usable & [all(frame - n in stored for n in delays) for frame in frames.tolist()])
         if len(rows):
             rows = rows[np.unique(np.linspace(0, len(rows) - 1, count).round().astype(int))]
         found = np.empty((len(delays), len(rows), len(grid.rig)))

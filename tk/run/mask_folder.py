@@ -30,12 +30,10 @@ class Written:
     Attributes:
         frames: number of the requested frames that have masks in the folder.
         now: number of frames whose masks this run has made.
-        empty: number of frames of this run in which nobody was found, by camera.
     """
 
     frames: int
     now: int
-    empty: dict[str, int]
 
 
 @one_thread()
@@ -98,7 +96,7 @@ def write_masks(
             reporter.note(f"{folder / name}: nobody in {count} of {len(missing)} frames")
     if start > 0 and not all(_file(folder, name, 0).exists() for name in capture.rig.names):
         reporter.note(f"{folder}: masks of the frames before {start} are missing; tk track needs them from frame 0 on")
-    return Written(stop - start, len(missing), empty)
+    return Written(stop - start, len(missing))
 
 
 def _check_folder(capture: Capture, folder: Path) -> None:

@@ -15,15 +15,15 @@ from tk.io.results.data import Result, UsedCameras
 from tk.io.results.revision import Revision
 from tk.io.results.status import Status
 from tk.model.body.cone_body import ConeBody
-from tk.model.cameras.bundle import TrackedPoses
+from tk.model.cameras.bundle import TrackedPerson
 from tk.model.cameras.camera import Rig
 from tk.model.cues import landmarks
 from tk.model.cues.cue import Measured, in_frames
 from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
-from tk.people.identity import COLUMNS, doubtful, exchanged, exchanged_masks, report
+from tk.people.identity import COLUMNS, doubtful, report, unmixed, unmixed_masks
 from tk.people.people import People
-from tk.run.delays import COMPARED, TrackedPerson, retimed, retimed_measured
+from tk.run.delays import COMPARED, retimed, retimed_measured
 from tk.run.draft import Draft, held, without_absent
 from tk.run.prefetch import open_observations
 from tk.run.refinement import compare_cameras, refine_if_inconsistent
@@ -78,7 +78,7 @@ def finish(
     """
     written, contacts = people.written, people.contacts
     kept = [held(result) for result in found]
-    results = exchanged(kept, contacts)
+    results = unmixed(kept, contacts)
     for line in report(contacts):
         note(line)
     drafts = []
@@ -89,7 +89,7 @@ def finish(
             columns = {dataset: getattr(result, name) for dataset, name in COLUMNS.items()}
             draft.columns = {dataset: values for dataset, values in columns.items() if values is not None}
         if masks is not None:
-            draft.masks = exchanged_masks(person.number, contacts, masks, result.frames)
+            draft.masks = unmixed_masks(person.number, contacts, masks, result.frames)
         drafts.append(draft)
     revisions, finisher = {}, _Finisher(task, len(written) == 1, note, within, task.setup.rig, film_again)
     if people.has_segments:
@@ -294,7 +294,7 @@ class _Finisher:
         tracker = drafts[0].tracker_and_masks[0]
         world, people = tracker.world, [self._seen(draft) for draft in drafts]
         agreement = compare_cameras(people, tracker.views)
-        if apart := "" if agreement is None else agreement.contradiction:
+        if apart := "" if agreement is None else agreement.size_contradiction:
             self.note(f"{apart}: all frames are suspect")
             for draft in drafts:
                 draft.unclear = ~draft.lost
@@ -323,9 +323,7 @@ class _Finisher:
         tracker, masks = draft.tracker_and_masks
         poses = tracker.world.poses_in(draft.current("pose"))
         compared = masks.without(draft.person.monitor.moved)
-        return TrackedPerson(
-            tracker.body, lru_cache(16)(compared.get), TrackedPoses(draft.result.frames, poses, ~draft.lost)
-        )
+        return TrackedPerson(tracker.body, lru_cache(16)(compared.get), draft.result.frames, poses, ~draft.lost)
 
     def _measured(self, draft: Draft, late: NDArray[np.int64]) -> Measured:
         """Return what the first pass has measured in the frames of a draft, in pixels of the cameras in use,

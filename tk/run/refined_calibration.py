@@ -15,10 +15,9 @@ from tk.io.captures.mask_store import MaskStore
 from tk.io.paths import check_output
 from tk.io.results.reader import read_result
 from tk.model.body.body_fit import INFORMATIVE_FRAMES
-from tk.model.cameras.bundle import TrackedPoses
+from tk.model.cameras.bundle import TrackedPerson
 from tk.model.cameras.refinement import Refined, RefinementSettings
 from tk.model.cameras.tracker_frame import TrackerFrame
-from tk.run.delays import TrackedPerson
 from tk.run.plan import reduce_images
 from tk.run.prefetch import open_observations
 from tk.run.refinement import refine_rig
@@ -63,8 +62,8 @@ def refine_capture(
     with open_observations(Task.of(source, config), note, image_step=0) as observations:
         for observation, _ in observations.frames(int(found.frames.min()), int(found.frames.max()) + 1):
             store.put(observation.index, observation.masks)
-    poses = TrackedPoses(found.frames, world.poses_in(tracked[1]), found.has_pose)
-    person = TrackedPerson(tracked[0].standing("z"), lru_cache(16)(store.get), poses)
+    body, poses = tracked[0].standing("z"), world.poses_in(tracked[1])
+    person = TrackedPerson(body, lru_cache(16)(store.get), found.frames, poses, found.has_pose)
     done = refine_rig([person], world.rig, how)
     if done is None:
         raise CaptureError(

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from tk.model.body.body_fit import INFORMATIVE_FRAMES
 from tk.model.cameras.agreement import LATE_FRAMES, CameraAgreement, camera_agreement
-from tk.model.cameras.bundle import choose_frames
+from tk.model.cameras.bundle import TrackedPerson, bundle_frames
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.people_bundle import Filmed
 from tk.model.cameras.refinement import SCALES, Refined, RefinementSettings, refine_cameras
 from tk.model.masks.silhouettes import Views
-from tk.run.delays import TrackedPerson, whole_delays
+from tk.run.delays import whole_delays
 
 Float = NDArray[np.float64]
 
@@ -68,10 +68,7 @@ def _chosen(
 ) -> list[Filmed] | None:
     """Return frames of each person, an equal number of all if possible; None if there are too few."""
     count = max(FRAMES // max(len(people), 1), INFORMATIVE_FRAMES)
-    found: list[Filmed] = [
-        (p.body, choose_frames(p.masks, views, p.body.skeleton, p.tracked, count, scales, cleaning, late))
-        for p in people
-    ]
+    found: list[Filmed] = [(p.body, bundle_frames(p, views, count, scales, cleaning, late)) for p in people]
     return found if sum(len(frames) for _, frames in found) >= INFORMATIVE_FRAMES else None
 
 

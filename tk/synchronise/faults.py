@@ -273,7 +273,7 @@ def _bins(look: Look, clocks: Clocks, c: int, begin: float, step: float) -> NDAr
     return np.asarray(np.floor((common - begin) / step), np.int64)
 
 
-def exchanged(
+def exchanged_videos(
     recordings: Sequence[Recording], looks: Sequence[Look], cameras: Sequence[Camera], clocks: Clocks
 ) -> tuple[float, tuple[int, int]] | None:
     """Return the probability that no two videos are exchanged, and the two whose exchange is most probable. None if the
@@ -305,7 +305,7 @@ def exchanged(
         shared = shared_planes(looks[i], looks[j], rays(i, c), rays(j, d), cameras[c].center, cameras[d].center)
         if shared is None:
             return 0.0
-        profiles = [planes_sum(moved[v], planes) for v, planes in zip((i, j), shared[:2], strict=True)]
+        profiles = [planes_sum(moved[v], planes) for v, planes in zip((i, j), shared, strict=True)]
         one, other = (profile - profile.mean(axis=0) for profile in profiles)
         _, _, z = correlate(one, other, round(SHORTEST_S / _BIN_S))
         return max(float(z[len(other) - 1]), 0.0) ** 2 / 2  # without a lag

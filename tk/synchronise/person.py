@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations, product
 
 import cv2
@@ -49,8 +49,6 @@ class Compared:
         first: the first lag, samples of the grid.
         z, r: (L,) significance and coefficient of each lag.
         start_i, start_j: own time of sample 0 of each camera, seconds.
-        sine: of the angle between the line through both cameras and the rays to what moves: if it is small, planes are
-            determined badly. 1 without known cameras.
     """
 
     i: int
@@ -60,7 +58,6 @@ class Compared:
     r: Float
     start_i: float
     start_j: float
-    sine: float = 1.0
 
     @property
     def highest(self) -> float:
@@ -89,7 +86,7 @@ def compare_planes(looks: Sequence[Look], cameras: Sequence[Camera], mirrored: i
     def one(pair: tuple[int, int]) -> Compared | None:
         i, j = pair
         profiles = _profiles(looks[i], looks[j], rays[i], rays[j], cameras[i].center, cameras[j].center)
-        return None if profiles is None else replace(_compared(i, j, *profiles[:2]), sine=profiles[2])
+        return None if profiles is None else _compared(i, j, *profiles)
 
     with ThreadPoolExecutor(2) as threads:
         return [found for found in threads.map(one, pairs) if found is not None]
@@ -145,21 +142,19 @@ def rays_of(look: Look, camera: Camera, mirrored: bool) -> Float:
 
 def shared_planes(
     a: Look, b: Look, rays_a: Float, rays_b: Float, center_a: Float, center_b: Float
-) -> tuple[NDArray[np.int64], NDArray[np.int64], float] | None:
+) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
     """Return for each pixel (h, w) of both cameras the plane through both centres in which it lies, -1 if it lies in
-    none, and the sine of :class:`Compared`; None if what moves lies in too few planes of both."""
+    none; None if what moves lies in too few planes of both."""
     base = center_b - center_a
     base = base / np.linalg.norm(base)
     side = np.cross(base, np.eye(3)[np.argmin(np.abs(base))])
     side /= np.linalg.norm(side)
     third = np.cross(base, side)
-    angles, usable, totals, means = [], [], [], []
+    angles, usable, totals = [], [], []
     for look, rays in ((a, rays_a), (b, rays_b)):
         angles.append(np.arctan2(rays @ third, rays @ side))
-        sine = np.linalg.norm(np.cross(rays, base), axis=2)
-        usable.append(sine > _LEAST_SINE)
+        usable.append(np.linalg.norm(np.cross(rays, base), axis=2) > _LEAST_SINE)
         totals.append(np.where(usable[-1], look.moved, 0.0))
-        means.append(float((sine * totals[-1]).sum() / max(totals[-1].sum(), 1e-9)))
     if not all(total.any() for total in totals):
         return None
     middle = float(np.angle((totals[0] * np.exp(1j * angles[0])).sum()))
@@ -172,7 +167,7 @@ def shared_planes(
     for angle, use in zip(angles, usable, strict=True):
         plane = np.floor((angle - low) / (high - low) * _PLANES).astype(int)
         found.append(np.where(use & (plane >= 0) & (plane < _PLANES), plane, -1))
-    return found[0], found[1], min(means)
+    return found[0], found[1]
 
 
 def planes_sum(motion: NDArray[np.float32], planes: NDArray[np.int64]) -> Float:
@@ -185,18 +180,18 @@ def planes_sum(motion: NDArray[np.float32], planes: NDArray[np.int64]) -> Float:
 
 def _profiles(
     a: Look, b: Look, rays_a: Float, rays_b: Float, center_a: Float, center_b: Float
-) -> tuple[tuple[float, Float], tuple[float, Float], float] | None:
-    """Return the motion in each plane through the centres, (N, P) on the grid, for both cameras, and the sine of
-    :class:`Compared`; None if they share too few planes."""
+) -> tuple[tuple[float, Float], tuple[float, Float]] | None:
+    """Return the motion in each plane through the centres, (N, P) on the grid, for both cameras; None if they share too
+    few planes."""
     shared = shared_planes(a, b, rays_a, rays_b, center_a, center_b)
     if shared is None:
         return None
     found = []
-    for look, planes in zip((a, b), shared[:2], strict=True):
+    for look, planes in zip((a, b), shared, strict=True):
         sums = planes_sum(look.changes, planes)
         start, grid = on_grid(look.middles_s, sums / np.sqrt(np.diff(look.times_s))[:, None])
         found.append((start, grid - grid.mean(axis=0)))
-    return found[0], found[1], shared[2]
+    return found[0], found[1]
 
 
 def _quantiles(values: Float, weights: Float) -> tuple[float, float]:

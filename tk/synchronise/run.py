@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from tk.model.cameras.camera import Camera
 from tk.synchronise.decide import Decision, decide, timecode_ties
 from tk.synchronise.faults import (
     SURE,
-    exchanged,
+    exchanged_videos,
     other_speed_or_order,
     sound_in_other_order,
     still_parts,
@@ -45,13 +45,11 @@ class Synchronised:
         recordings: the cameras; the first is the reference.
         decision: clocks, methods, notes.
         looks: small images of each camera.
-        mirrored: cameras whose images are mirrored.
     """
 
     recordings: list[Recording]
     decision: Decision
     looks: list[Look]
-    mirrored: list[int] = field(default_factory=list)
 
     @property
     def clocks(self) -> Clocks:
@@ -125,7 +123,7 @@ def synchronise(
     if not clocks.connected[1:].any():  # the first camera may be the wrong one: the others are compared
         clocks = max((solve(count, ties, root) for root in range(count)), key=lambda each: int(each.connected.sum()))
     faulty = other_speed_or_order(recordings, signals, clocks, ties) | faulty
-    if cameras and not faulty and (places := exchanged(recordings, looks, cameras, decision.clocks)):
+    if cameras and not faulty and (places := exchanged_videos(recordings, looks, cameras, decision.clocks)):
         right, (a, b) = places
         if right < 1 - SURE:
             faulty[a] = (
@@ -144,7 +142,7 @@ def synchronise(
     decision.notes.extend(unchecked_chapters(recordings, signals, clocks, ties))
     decision.notes.extend(still_parts(recordings, looks, clocks))
     decision.faulty.update(faulty)
-    return Synchronised(recordings, decision, looks, mirrored)
+    return Synchronised(recordings, decision, looks)
 
 
 def by_hand(recordings: list[Recording], offsets_s: dict[str, float], begin_s: float | None) -> Synchronised:
@@ -163,7 +161,7 @@ def by_hand(recordings: list[Recording], offsets_s: dict[str, float], begin_s: f
     count = len(names)
     nan = np.full(count, np.nan)
     offsets = np.array([offsets_s[name] for name in names])
-    clocks = Clocks(offsets, np.ones(count), nan, nan, np.zeros(count))
+    clocks = Clocks(offsets, np.ones(count), nan, nan)
     decision = Decision(clocks, ["by hand"] * count)
     ties = [Tie(0, c, offsets[c] - offsets[0], 0.0, 1.0, "hand") for c in range(1, count)]
     return Synchronised(recordings, decision, _look(recordings, ties, begin_s, str))

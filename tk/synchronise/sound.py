@@ -92,13 +92,10 @@ class Heard:
 
     Attributes:
         ties: none if it is not certain.
-        windows, others: how many windows agree on the best offset, and on the second.
         jump: a part at another offset; None without one.
     """
 
     ties: tuple[Tie, ...]
-    windows: int
-    others: int
     jump: Jump | None = None
 
 
@@ -196,7 +193,7 @@ def _compare(i: int, j: int, a: Track, b: Track, onsets_a: Float, onsets_b: Floa
             found.append((lag, *_confirm(a.samples, b.samples, lag, (onsets_a, onsets_b))))
     found.sort(key=lambda each: (-len(each[1]), -sum(strength for _, _, strength in each[1])))
     if not found:
-        return Heard((), 0, 0)
+        return Heard(())
     hits = found[0][1]
     others = max((_apart(each[1]) for each in found[1:] if each[1] and not _alike(each[1], hits)), default=0)
     jump = _jump(a, b, hits, [each[1] for each in found[1:] if _apart(each[1]) > (1 if each[2] else 2)])
@@ -205,10 +202,10 @@ def _compare(i: int, j: int, a: Track, b: Track, onsets_a: Float, onsets_b: Floa
     enough = min(_AGREEING, max(2, both_s // _WINDOW_S))  # all windows of a short recording
     sure = (_apart(hits) >= enough or found[0][2]) and _apart(hits) > 2 * others
     if not sure:
-        return Heard((), _apart(hits), others, jump)
+        return Heard((), jump)
     sigma = _sigma(hits)
     ties = tuple(Tie(i, j, a.start_s + at / RATE, b.start_s + (at - lag) / RATE, sigma, "sound") for at, lag, _ in hits)
-    return Heard(ties, _apart(hits), others, jump)
+    return Heard(ties, jump)
 
 
 def _jump(a: Track, b: Track, hits: Sequence[Hit], others: Sequence[Sequence[Hit]]) -> Jump | None:

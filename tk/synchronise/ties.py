@@ -51,7 +51,6 @@ class Clocks:
         offsets_s, rates: (C,); NaN for cameras that no tie connects to the reference.
         offset_sigma_s: (C,) standard deviation of the common time in the middle of the ties, seconds.
         rate_sigma: (C,) standard deviations; that of the prior where nothing determines a rate.
-        skew_s: (C,) by how much the sound of each camera is late, seconds, relative to its pictures.
         dropped: pairs of cameras and methods that contradict the others.
     """
 
@@ -59,7 +58,6 @@ class Clocks:
     rates: Float
     offset_sigma_s: Float
     rate_sigma: Float
-    skew_s: Float
     dropped: tuple[tuple[int, int, str], ...] = ()
 
     @property
@@ -158,7 +156,5 @@ def _fit(
     residuals[[k for k, tie in enumerate(ties) if known[tie.i]]] = inner * [tie.sigma_s for tie in used]
     offsets = x[:count] - x[count : 2 * count] * middle
     nan = np.where(known, 0.0, np.nan)
-    clocks = Clocks(
-        offsets + nan, 1.0 + x[count : 2 * count], sigma[:count] + nan, sigma[count : 2 * count], x[2 * count :]
-    )
+    clocks = Clocks(offsets + nan, 1.0 + x[count : 2 * count], sigma[:count] + nan, sigma[count : 2 * count])
     return clocks, residuals

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.body.limb_candidates import Limb, exchanged
+from tk.model.body.limb_candidates import Limb, exchanged_limbs
 from tk.model.body.skeleton import JOINTS, blocks
 from tk.model.cues.ray_costs import Evidence
 from tk.model.masks.silhouettes import Pyramid
@@ -126,7 +126,7 @@ class Choice:
         arms = [limb for limb in limbs if limb.name.startswith("arm")]
         legs = tuple(limb for limb in limbs if limb.name.startswith("leg"))
         rest = np.setdiff1d(every, np.concatenate([arm.dofs for arm in arms]))
-        swapped = np.concatenate([exchanged(poses, [legs])[0] for poses in blocks(self.poses)])
+        swapped = np.concatenate([exchanged_limbs(poses, [legs])[0] for poses in blocks(self.poses)])
         self._choose([Alternative(every), Alternative(rest, begins=swapped)])
         left_open = [] if modes is None else list(modes.swapaxes(0, 1))
         for limb in limbs:

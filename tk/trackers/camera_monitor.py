@@ -145,8 +145,8 @@ class CameraMonitor(Stateful[MonitorState]):
         C = len(self._names)
         self.doubted = np.zeros(C, bool)
         self._cameras = Cameras(C, setup.fps)
-        self._region = tracker if isinstance(tracker, RegionTracker) else None  # only this one has residuals
-        self._frames = FrameJudge(tracker, C, setup.fps, self._region.config.false_alarm if self._region else 0.5)
+        self._region = region = tracker if isinstance(tracker, RegionTracker) else None  # only this one has residuals
+        self._frames = FrameJudge(tracker, C, setup.fps, region.region_settings.false_alarm if region else 0.5)
         self._spans: dict[str, Span] = {}
         self._opening_reasons: dict[int, str] = {}
 

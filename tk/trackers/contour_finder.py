@@ -26,12 +26,11 @@ from tk.model.body.initial_pose import rough_pose
 from tk.model.body.limb_candidates import Limb, limbs_of
 from tk.model.body.skeleton import JOINTS, build_skeleton, convert_poses
 from tk.model.body.stored_body import body_values
-from tk.model.cameras.bundle import CORRELATION_PX
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.landmark_agreement import consensus
 from tk.model.cameras.tracker_frame import TrackerFrame
 from tk.model.cues import landmarks
-from tk.model.cues.cue import Cue
+from tk.model.cues.cue import CONTOUR_INFORMATION, Cue
 from tk.model.cues.part_colors import PartColors, RenderedBody, color_bins
 from tk.model.cues.ray_costs import Evidence, RayGrid, unpacked
 from tk.model.masks.silhouettes import Pyramid, Views
@@ -41,7 +40,7 @@ from tk.optim.gauss_newton import BatchSolution, GaussNewtonSettings
 from tk.optim.quadratic import Quadratic
 from tk.settings import SilhouetteSettings
 from tk.trackers.hypotheses import PROPOSED, SAME_POSE_M, TrajectoryHypothesis, turning
-from tk.trackers.initialisation import MOST_STATURE_RATIO, Found, find_in, find_person, stature_of
+from tk.trackers.initialisation import MOST_STATURE_RATIO, FoundPoses, find_in, find_person, stature_of
 from tk.trackers.proposals import exchanged, limbs
 from tk.trackers.proposals.anywhere import centroid
 from tk.trackers.protocol import Frame
@@ -51,8 +50,6 @@ Float = NDArray[np.float64]
 # Standard deviation of the logarithm of a stature that was estimated: areas of silhouettes err by 6 %, lengths between
 # landmarks by 2 % about a mean that is 5 % too small.
 ESTIMATED_STATURE_DEVIATION = 0.05
-# Information of one pixel of contour, 1/px²: edgels err by 2 px. The unit of the contours' equations.
-INFORMATION = 1.0 / (2.0**2 * CORRELATION_PX)
 # Rows of the grid of rays: to screen many candidates of a limb, and to choose among few poses.
 COARSE_ROWS, FINE_ROWS = 54, 96
 LINE_SEARCH = SearchSettings()
@@ -87,16 +84,14 @@ class _Begun:
     Attributes:
         masks: of the frame.
         subject: what was known of the person.
-        average: the average body.
-        rough: (D,) the known rough pose on this body, if any.
+        rough: (D,) the known rough pose on the average body, if any.
         found: what the frame shows.
     """
 
     masks: NDArray[np.uint8]
     subject: Subject
-    average: BodyDimensions
     rough: Float | None
-    found: Found
+    found: FoundPoses
 
     def serves(self, frame: Frame, subject: Subject) -> bool:
         """Return whether the same search in a frame would find the same."""
@@ -113,7 +108,7 @@ class ContourFinder:
     Args:
         rig: the cameras.
         up: the upward direction of their world, see :func:`tk.model.cameras.up.up_vector`.
-        config: see :class:`~tk.settings.SilhouetteSettings`.
+        settings: see :class:`~tk.settings.SilhouetteSettings`.
         fps: frames per second.
         line_search: how edges are searched along the contours' normals.
         solver: scales and iterations of Gauss-Newton.
@@ -124,13 +119,13 @@ class ContourFinder:
         self,
         rig: Rig,
         up: str,
-        config: SilhouetteSettings,
+        settings: SilhouetteSettings,
         fps: float = 15.0,
         line_search: SearchSettings = LINE_SEARCH,
         solver: GaussNewtonSettings = SOLVER,
         seed: int = 0,
     ) -> None:
-        self.contours, self.line_search, self.solver = config, line_search, solver
+        self.settings, self.line_search, self.solver = settings, line_search, solver
         self.rig, self.up, self.fps, self.seed = rig, up, fps, seed
         self.world = TrackerFrame.of(rig, up)
         self.views = Views(self.world.rig)
@@ -146,7 +141,7 @@ class ContourFinder:
     @property
     def search_frames(self) -> int:
         """Frames between two routine limb searches; 0: none."""
-        seconds = self.contours.search_every
+        seconds = self.settings.search_every
         return max(int(seconds * self.fps), 1) if seconds else 0
 
     @property
@@ -157,7 +152,7 @@ class ContourFinder:
     @property
     def opening_frames(self) -> int:
         """Number of frames used by the initialisation."""
-        return self.contours.init_frames
+        return self.settings.init_frames
 
     @property
     def body(self) -> ConeBody:
@@ -224,7 +219,7 @@ class ContourFinder:
             begun = self._begin(frames[0], pyramids[0], subject, len(frames) == 1)
         seen = [self.see(blind(f), pyramid=shown) for f, shown in zip(frames, pyramids, strict=True)]
         hypotheses = find_person(self, seen, begun.rough, begun.found)
-        if not self.contours.adapt or subject.body is not None:
+        if not self.settings.adapt or subject.body is not None:
             return np.asarray(hypotheses[0].poses[0])
         expected = BodyDimensions.from_stature(stature or stature_of(self, pyramids, subject.hull_m))
         return self._adapt(frames, pyramids, hypotheses, expected.barefoot, stature is not None)
@@ -246,7 +241,7 @@ class ContourFinder:
         if init is not None:
             rough = self.settle(pyramid, convert_poses(angles, given, self.body.skeleton)[None]).states[0]
         found = find_in(self, self.see(blind(frame), pyramid=pyramid), rough, alone)
-        return _Begun(frame.masks, subject, average, rough, found)
+        return _Begun(frame.masks, subject, rough, found)
 
     def _adapt(
         self,
@@ -328,7 +323,7 @@ class ContourFinder:
             self._cues = of_these, [of(rig, body, measured[name]) for name, of in CUES.items() if name in measured]
         return self._cues[1]
 
-    def contradiction(self, pyramid: Pyramid, poses: Float) -> Float:
+    def cue_variance(self, pyramid: Pyramid, poses: Float) -> Float:
         """Return (B, J) variance of the joints' positions, metres², by which the cues contradict poses (B, D)."""
         return sum((cue.variance(poses) for cue in self.cues(pyramid)), np.zeros((len(poses), len(JOINTS))))
 
@@ -348,7 +343,7 @@ class ContourFinder:
             poses: (B, D).
             levels: scales, 0 the finest; None: all.
             images: with images, colour differences attract contours inside the silhouette, too.
-            prior: of the poses, in the units of the contours' equations, see :data:`INFORMATION`.
+            prior: of the poses, in the unit of the contours' equations, see :mod:`tk.model.cues.cue`.
             limb: only this limb moves.
         """
         body = self.body
@@ -374,7 +369,7 @@ class ContourFinder:
             return None
 
         def all_of(poses: Float) -> Quadratic:
-            terms = [cue.normal(poses).scaled(cue.weight / INFORMATION) for cue in cues]
+            terms = [cue.normal(poses).scaled(cue.weight / CONTOUR_INFORMATION) for cue in cues]
             return reduce(add, terms if prior is None else [*terms, prior])
 
         return all_of

@@ -71,7 +71,7 @@ class ContourTracker(ContourFinder, Stateful[S], ABC):
         """Return the body on the grid :attr:`fine_grid`: at the last pose, or at the one expected in the next frame."""
         pose, before = self.last_poses()
         if ahead:
-            pose = pose + self.contours.prediction * (pose - before)
+            pose = pose + self.settings.prediction * (pose - before)
         met = self.fine_grid.render(self.body, pose[None])
         return RenderedBody(met.label[0], met.depth[0], self.body.color_group, self.colors.log_likelihood)
 

@@ -65,16 +65,6 @@ def disagreement(skeleton: Skeleton, poses: Float, cost: Float) -> Float:
     return np.asarray(np.einsum("h,hja->j", weight, (joints - mean) ** 2) / 3)
 
 
-def different(skeleton: Skeleton, poses: Float, least_m: float) -> NDArray[np.int64]:
-    """Return the indices of those poses (B, D) that differ from all before them by ``least_m`` in a joint, metres."""
-    kept: list[int] = []
-    joints = skeleton.joints(poses)
-    for i in range(len(poses)):
-        if all(np.linalg.norm(joints[i] - joints[k], axis=-1).max() > least_m for k in kept):
-            kept.append(i)
-    return np.array(kept, np.int64)
-
-
 def turning(skeleton: Skeleton, poses: Float, before: Float) -> Float:
     """Return (B,) the negative logarithm of the prior of the headings of poses (B, D) after a pose (D,), nats."""
     yaw = skeleton.index("torso_yaw")

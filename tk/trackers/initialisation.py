@@ -25,12 +25,12 @@ from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.initial_pose import GREATEST_STATURE, LEAST_STATURE
 from tk.model.body.joints import HIPS, JOINTS, SHOULDERS
 from tk.model.body.limb_candidates import DISTINCT_M
-from tk.model.body.skeleton import Skeleton
+from tk.model.body.skeleton import Skeleton, distinct
 from tk.model.cues import landmarks as landmark_cue
 from tk.model.cues.ray_costs import Evidence
 from tk.model.masks.silhouettes import Pyramid
 from tk.model.setup import AVERAGE_STATURE_M
-from tk.trackers.hypotheses import DROPPED, TrajectoryHypothesis, different, walking
+from tk.trackers.hypotheses import DROPPED, TrajectoryHypothesis, walking
 from tk.trackers.proposals import anywhere, landmarks, opposite
 from tk.trackers.proposals.anywhere import centroid
 
@@ -59,7 +59,7 @@ TRUNK = [JOINTS.index(name) for name in ("pelvis", "neck", *SHOULDERS, *HIPS)]
 
 
 def find_person(
-    finder: ContourFinder, seen: Sequence[Seen], pose: Float | None = None, begun: Found | None = None
+    finder: ContourFinder, seen: Sequence[Seen], pose: Float | None = None, begun: FoundPoses | None = None
 ) -> list[TrajectoryHypothesis]:
     """Return trajectory hypotheses over F consecutive frames, best first. Those after the first are nearly as probable;
     the caller fits a body to each of them to decide.
@@ -88,7 +88,7 @@ def find_person(
         except CaptureError:
             continue
         least = min(least, residual)
-        if residual > finder.contours.lost_error:
+        if residual > finder.settings.lost_error:
             continue
         alternatives += [(rank, int(anchor), pose) for rank, pose in enumerate(poses[1:])]
         if _contains(skeleton, hypotheses, anchor, poses[0]):
@@ -110,13 +110,8 @@ def find_person(
         new = [pose for _, pose in group if not _contains(skeleton, hypotheses, anchor, pose)]
         hypotheses += _follow(finder, seen, new, anchor)
     hypotheses.sort(key=lambda hypothesis: hypothesis.cost)
-    kept: list[TrajectoryHypothesis] = []
-    for hypothesis in hypotheses:
-        joints = skeleton.joints(hypothesis.poses)
-        apart = [np.max(skeleton.apart(other.poses, joints)) for other in kept]
-        if hypothesis.cost <= hypotheses[0].cost + DROPPED and all(distance > DISTINCT_M for distance in apart):
-            kept.append(hypothesis)
-    return kept
+    hypotheses = [one for one in hypotheses if one.cost <= hypotheses[0].cost + DROPPED]
+    return [hypotheses[i] for i in distinct(skeleton.joints(np.array([one.poses for one in hypotheses])), DISTINCT_M)]
 
 
 def _contains(skeleton: Skeleton, hypotheses: Sequence[TrajectoryHypothesis], frame: int, pose: Float) -> bool:
@@ -125,7 +120,7 @@ def _contains(skeleton: Skeleton, hypotheses: Sequence[TrajectoryHypothesis], fr
     return any(skeleton.apart(hypothesis.poses[frame], joints) < DISTINCT_M for hypothesis in hypotheses)
 
 
-class Found(NamedTuple):
+class FoundPoses(NamedTuple):
     """The residual (E_S) of the best pose in a frame, and poses (B, D): the best one, then those that are not
     improbable beside it."""
 
@@ -133,7 +128,7 @@ class Found(NamedTuple):
     poses: Float
 
 
-def find_in(finder: ContourFinder, seen: Seen, pose: Float | None, alone: bool) -> Found:
+def find_in(finder: ContourFinder, seen: Seen, pose: Float | None, alone: bool) -> FoundPoses:
     """Return what is found in one frame.
 
     Args:
@@ -149,12 +144,12 @@ def find_in(finder: ContourFinder, seen: Seen, pose: Float | None, alone: bool) 
                 f"initialisation: no mask of frame {seen.frame.index} shows anybody: check the masks, or give the pose "
                 "of another frame"
             )
-        return Found(0.0, finder.improved(seen, pose)[None])
+        return FoundPoses(0.0, finder.improved(seen, pose)[None])
     skeleton = finder.body.skeleton
     found = np.concatenate([anywhere.propose(finder, seen), landmarks.propose(finder, seen)])
     both = [opposite.propose(finder, seen, pose, range(finder.solver.scales)[::-1]) for pose in found[:OPPOSITE]]
     found = np.concatenate([found, *both])
-    found = found[different(skeleton, found, DISTINCT_M)]
+    found = found[distinct(skeleton.joints(found), DISTINCT_M)]
     # A limb search moves limbs only: it brings a pose to where it brings a likelier one with the same trunk. A pose of
     # a single frame gets worse by that.
     before, trunk = seen.evidence.cost(finder.body, found), skeleton.joints(found)[:, TRUNK]
@@ -165,8 +160,8 @@ def find_in(finder: ContourFinder, seen: Seen, pose: Float | None, alone: bool) 
     cost = seen.evidence.cost(finder.body, poses)
     order = np.argsort(cost, kind="stable")
     kept = poses[order[cost[order] < cost.min() + DROPPED]]
-    kept = kept[different(skeleton, kept, DISTINCT_M)]
-    return Found(float(finder.mean_residual(seen.pyramid, kept[:1], seen.frame.uncertain)[0]), kept)
+    kept = kept[distinct(skeleton.joints(kept), DISTINCT_M)]
+    return FoundPoses(float(finder.mean_residual(seen.pyramid, kept[:1], seen.frame.uncertain)[0]), kept)
 
 
 def _follow(
@@ -184,7 +179,7 @@ def _follow(
         for i in range(anchor + step, end, step):
             last = poses[:, i - step]
             before = poses[:, i - 2 * step] if abs(i - anchor) > 1 else poses[:, anchor]
-            now = finder.settle(seen[i].pyramid, last + finder.contours.prediction * (last - before)).states
+            now = finder.settle(seen[i].pyramid, last + finder.settings.prediction * (last - before)).states
             cost = seen[i].evidence.cost(finder.body, now)
             if not np.isfinite(cost).any():  # no camera sees anybody
                 poses[:, i] = last
@@ -232,7 +227,7 @@ def stature_of(finder: ContourFinder, pyramids: Sequence[Pyramid], hull_m: float
             p_centroid = centroid(rig, pyramid, 0)
         except CaptureError:
             continue
-        poses = gait.figures(body.skeleton, 4, 0, p_centroid)  # standing, and the Da Vinci pose
+        poses = gait.gait_figures(body.skeleton, 4, 0, p_centroid)  # standing, and the Da Vinci pose
         evidence = Evidence.of(finder.coarse_grid, pyramid.masks[0])
         _, met = evidence.cast(body, poses)
         drawn = met.label > 0 if evidence.others is None else (met.label > 0) & ~evidence.others

@@ -30,12 +30,13 @@ from tk.io.results.status import Status
 from tk.kernels.mask_values import PERSON
 from tk.kernels.silhouette import normal_equations
 from tk.model.body.body_fit import STATURE_DEVIATION
+from tk.model.body.body_parameters import FITTED_STATURE_DEVIATION
 from tk.model.body.joint_sigma import CHANGING_M, directions, pose_variance, posture_variance
 from tk.model.body.limb_candidates import Limb, turned
-from tk.model.body.skeleton import JOINTS
+from tk.model.body.skeleton import JOINTS, distinct
 from tk.model.cameras.camera import Rig
 from tk.model.cues import landmarks
-from tk.model.cues.cue import Measured, in_frames
+from tk.model.cues.cue import CONTOUR_INFORMATION, Measured, in_frames
 from tk.model.cues.part_colors import LearnedColors, color_bins
 from tk.model.cues.ray_costs import Evidence
 from tk.model.masks.mosaic import doubled
@@ -45,7 +46,7 @@ from tk.model.reduced_images import crop
 from tk.model.setup import Setup, Subject
 from tk.optim.quadratic import Quadratic
 from tk.settings import RegionSettings, Settings, SilhouetteSettings
-from tk.trackers.contour_finder import INFORMATION, Seen
+from tk.trackers.contour_finder import Seen
 from tk.trackers.contour_tracker import ContourTracker
 from tk.trackers.hypotheses import DROPPED, PROPOSED, RENEWAL, SAME_POSE_M, Hypothesis, disagreement, walking
 from tk.trackers.judgement import RECOVER_EVERY, Match, depth_known
@@ -55,7 +56,7 @@ from tk.trackers.proposals import opposite as of_heading
 from tk.trackers.protocol import Estimate, Frame, Stopwatch
 from tk.trackers.reason import Reason, is_lost
 from tk.trackers.residual import BaselineState, ResidualBaseline, variance_factor
-from tk.trackers.second_pass import STATURE, SecondPass
+from tk.trackers.second_pass import SecondPass
 
 Float = NDArray[np.float64]
 
@@ -138,13 +139,13 @@ class RegionTracker(ContourTracker[RegionState]):
         self,
         rig: Rig,
         up: str,
-        contours: SilhouetteSettings | None = None,
-        config: RegionSettings | None = None,
+        settings: SilhouetteSettings | None = None,
+        region_settings: RegionSettings | None = None,
         fps: float = 15.0,
         seed: int = 0,
     ) -> None:
-        super().__init__(rig, up, contours or SilhouetteSettings(), fps, seed=seed)
-        self.config = config or RegionSettings()
+        super().__init__(rig, up, settings or SilhouetteSettings(), fps, seed=seed)
+        self.region_settings = region_settings or RegionSettings()
         self._alive: list[Hypothesis] = []
         self._mean_posture: Float = np.zeros((len(JOINTS), 3))
         self._postures = 0
@@ -155,7 +156,7 @@ class RegionTracker(ContourTracker[RegionState]):
 
     def _reset(self) -> None:
         """Forget the residuals and everything that was decided from them."""
-        self.residuals = ResidualBaseline(len(self.rig), self.config.false_alarm)
+        self.residuals = ResidualBaseline(len(self.rig), self.region_settings.false_alarm)
         self._lost_for = self._refused = self._high_for = 0
         self._searched = _NEVER
 
@@ -206,7 +207,7 @@ class RegionTracker(ContourTracker[RegionState]):
             frame = Frame(i, np.empty((len(shown), 0, 0, 3), np.uint8), shown)
             both[i, 1] = self.improved(self.see(frame, pyramid=pyramid), both[i, 1])
         stature = height_m or self.body.dimensions.barefoot
-        deviation = STATURE_DEVIATION if height_m else STATURE
+        deviation = STATURE_DEVIATION if height_m else FITTED_STATURE_DEVIATION
         trackers, costs = (self.with_cameras(self.rig), self.with_cameras(self.rig)), []
         for tracker, one in zip(trackers, both.swapaxes(0, 1), strict=True):
             fitted = self.fit(seen, one, np.arange(len(seen)), stature, deviation)
@@ -216,18 +217,18 @@ class RegionTracker(ContourTracker[RegionState]):
 
     def step(self, frame: Frame) -> Estimate:
         watch = Stopwatch()
-        contours, config = self.contours, self.config
+        settings, own = self.settings, self.region_settings
         frame = self.without_foreign(frame)
-        seen = self.see(frame, frame.images if config.colors else None)
+        seen = self.see(frame, frame.images if own.colors else None)
         pyramid, evidence = seen.pyramid, seen.evidence
         watch.lap("masks_clean")
         # predict, settle
         self._alive += [replace(h, previous=h.pose, jumped=False) for h in self._alive if h.jumped]
         # angles that only landmarks show change when these are seen, not by motion
-        velocity = np.where(self.body.skeleton.is_by_landmarks, 0.0, contours.prediction)
+        velocity = np.where(self.body.skeleton.is_by_landmarks, 0.0, settings.prediction)
         starts = np.array([h.pose + velocity * (h.pose - h.previous) for h in self._alive])
         prior = self.prior(starts)
-        poses, _, iterations = self.settle(pyramid, starts, self._scales(), seen.images, prior)
+        poses, iterations = self.settle(pyramid, starts, self._scales(), seen.images, prior)
         watch.lap("optimise")
         mismatch, met = evidence.cast(self.body, poses)
         if not np.isfinite(mismatch).all():
@@ -267,14 +268,14 @@ class RegionTracker(ContourTracker[RegionState]):
         pose, error = self._best.pose, float(np.nanmean(look.error))
         reason = Match(
             error,
-            contours.lost_error,
+            settings.lost_error,
             excess=self.residuals.mean_excess(look.error),
             cut=cut,
             lost_for=self._lost_for,
             refused=self._refused,
             high_for=self._high_for if self.residuals.high(look.error) else 0,
             depth=bool(depth_known(self.world.rig, self.body.skeleton.joints(pose), look.residual)),
-            false_alarm=config.false_alarm,
+            false_alarm=own.false_alarm,
         ).reason
         if reason != Reason.UNEXPLAINED:
             self._learn(evidence, look)
@@ -330,7 +331,7 @@ class RegionTracker(ContourTracker[RegionState]):
 
         Their pixels become uncertain, because parts of the body may be in front of or behind them.
         """
-        if not (self.config.colors and self.colors.known and frame.images.size):
+        if not (self.region_settings.colors and self.colors.known and frame.images.size):
             return frame
         foreign, grid = self.colors.foreign, self.coarse_grid
         person = grid.sample(frame.masks) >= PERSON
@@ -373,11 +374,11 @@ class RegionTracker(ContourTracker[RegionState]):
         joint may be from its prediction: its last step times the unpredicted share; from the finest of all alone
         Gauss-Newton does not converge. After a jump, a loss or a high residual it is the coarsest.
         """
-        contours, skeleton, solver = self.contours, self.body.skeleton, self.solver
+        settings, skeleton, solver = self.settings, self.body.skeleton, self.solver
         first, window_px = solver.scales - 1, self.line_search.window_px
         if not (self._lost_for or self._high_for or any(h.jumped for h in self._alive)):
             step_m = max(skeleton.apart(h.pose, skeleton.joints(h.previous)) for h in self._alive)
-            error_m = abs(1 - contours.prediction) * step_m
+            error_m = abs(1 - settings.prediction) * step_m
             error_px = error_m * self.views.rig.pixels_per_metre(skeleton.joints(self._best.pose)[0])
             while first > self.search_level and window_px * 2 ** (first - 1) >= error_px:
                 first -= 1
@@ -389,23 +390,19 @@ class RegionTracker(ContourTracker[RegionState]):
         deviation = np.where(skeleton.prismatic, TRANSLATION_M, np.radians(angle_deg))
         straight = skeleton.is_straight
         deviation[straight] = skeleton.straight[straight]
-        return Quadratic.about(np.where(straight, 0.0, mean), deviation**-2 / INFORMATION)
+        return Quadratic.about(np.where(straight, 0.0, mean), deviation**-2 / CONTOUR_INFORMATION)
 
     def _rank(self) -> None:
         """Sort the hypotheses by cost; drop those that are improbable beside the best, or equal."""
         if len(self._alive) == 1:
             self._alive = [replace(self._alive[0], age=1)]
             return
-        skeleton = self.body.skeleton
-        kept: list[Hypothesis] = []
-        joints: list[Float] = []
-        for h in sorted(self._alive, key=lambda h: h.cost):
-            if kept and h.cost > kept[0].cost + DROPPED:
-                continue
-            if all(skeleton.apart(h.pose, other) > SAME_POSE_M for other in joints):
-                kept.append(h)
-                joints.append(skeleton.joints(h.pose))
-        self._alive = [replace(kept[0], age=1), *kept[1 : self.config.hypotheses]]
+        ranked = sorted(self._alive, key=lambda h: h.cost)
+        ranked = [h for h in ranked if h.cost <= ranked[0].cost + DROPPED]
+        kept = distinct(
+            self.body.skeleton.joints(np.array([h.pose for h in ranked])), SAME_POSE_M, self.region_settings.hypotheses
+        )
+        self._alive = [replace(ranked[0], age=1), *(ranked[i] for i in kept[1:])]
 
     def misplaced(self, evidence: Evidence, label: NDArray[np.uint8]) -> tuple[Limb, ...]:
         """Return the limbs of which a large part lies outside the mask, or on colours that are not theirs."""
@@ -445,7 +442,7 @@ class RegionTracker(ContourTracker[RegionState]):
         """Return whether the person is searched for as at the start, because the last frame was lost, or the residual
         (E_S, (V,)) is above the limit or stays high. Searches for the last reason become rarer: after 3, 6, 12 …
         frames; of a lost person they are in every third frame."""
-        error, limit = float(np.nanmean(by_view)), self.contours.lost_error
+        error, limit = float(np.nanmean(by_view)), self.settings.lost_error
         self._high_for = self._high_for + 1 if self.residuals.high(by_view) else 0
         waits, rest = divmod(self._high_for, RECOVER_EVERY)
         if rest == 0 and waits.bit_count() == 1:
@@ -456,7 +453,7 @@ class RegionTracker(ContourTracker[RegionState]):
         """Update the baseline of the residual; the colours, too, if E_S is not above the baseline. A pixel counts less,
         the more in doubt it is."""
         person, doubt = evidence.person, evidence.doubt
-        if self.config.colors and evidence.bins is not None and self.residuals.mean_excess(look.error) <= 0:
+        if self.region_settings.colors and evidence.bins is not None and self.residuals.mean_excess(look.error) <= 0:
             self.colors.learn(evidence.bins[person], look.label[person], None if doubt is None else 1 - doubt[person])
         self.residuals.learn(look.residual)
 
@@ -476,7 +473,7 @@ class RegionTracker(ContourTracker[RegionState]):
         self._postures += 1
         self._mean_posture += (directions(skeleton, pose) - self._mean_posture) / self._postures
         variance += posture_variance(skeleton, pose, self._mean_posture) + self._spread
-        variance += self.contradiction(seen.pyramid, pose[None])[0]
+        variance += self.cue_variance(seen.pyramid, pose[None])[0]
         if len(self._alive) > 1:
             poses, cost = (np.array(column) for column in zip(*((h.pose, h.cost) for h in self._alive), strict=True))
             variance += disagreement(skeleton, poses, cost)
@@ -502,7 +499,7 @@ class RegionTracker(ContourTracker[RegionState]):
         """
         skeleton, search = self.body.skeleton, self.line_search
         if view_m:
-            search = replace(search, displacement=1.0 / (view_m**2 * INFORMATION))
+            search = replace(search, displacement=1.0 / (view_m**2 * CONTOUR_INFORMATION))
         regions = None if images is None else self.colors.regions(images, self.views.rig.frame_shape)
         here = normal_equations(self.body.arrays, self.views.at(pyramid, 0), poses, search, regions)
         terms = self.terms(pyramid, prior)
@@ -515,7 +512,7 @@ class RegionTracker(ContourTracker[RegionState]):
         pull = self.solver.limit_weight * unit[:, None] * (excess != 0)
         hessian = here.hessian + matrix + pull[:, :, None] * np.eye(poses.shape[1])
         gradient = here.gradient + linear - (matrix @ poses[..., None])[..., 0] + pull * excess
-        return INFORMATION * hessian, INFORMATION * gradient
+        return CONTOUR_INFORMATION * hessian, CONTOUR_INFORMATION * gradient
 
     def variance(self, pose: Float, covariance: Float, residual: Float) -> Float:
         """Return (..., J) variance of the joints' positions along an axis, metres², scaled by the residual.
@@ -560,7 +557,7 @@ class RegionTracker(ContourTracker[RegionState]):
             return poses, residual, np.zeros((len(poses), len(JOINTS)))
         inside = self.world.poses_in(poses)
         again = SecondPass(self, masks, measured or {}, modes, colors, inside, lost, residual, report)
-        if self.contours.adapt and not keep_body:
+        if self.settings.adapt and not keep_body:
             again.fit_body(height_m)
         again.settle()
         again.decide()
@@ -587,7 +584,7 @@ class RegionTracker(ContourTracker[RegionState]):
 
     def with_cameras(self, rig: Rig) -> RegionTracker:
         """Return a tracker of the same body and colours with other cameras."""
-        fresh = RegionTracker(rig, self.up, self.contours, self.config, self.fps, self.seed)
+        fresh = RegionTracker(rig, self.up, self.settings, self.region_settings, self.fps, self.seed)
         fresh.take_body(self.body)
         fresh.view_m = self.view_m
         fresh.colors.state = self.colors.state

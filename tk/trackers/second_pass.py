@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.body.body_fit import STATURE_DEVIATION
+from tk.model.body.body_parameters import FITTED_STATURE_DEVIATION
 from tk.model.body.joint_sigma import CONSTANT_M, directions, posture_variance
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.bundle import LONGEST_STEP, SEGMENT_M
@@ -43,8 +44,6 @@ Float = NDArray[np.float64]
 
 # Frames of the body fit.
 FIT_FRAMES = 24
-# Standard deviation of the logarithm of the stature about that of the first fit, where no height was given.
-STATURE = 0.03
 # Iterations over all frames together; frames of which the equations are in memory at once, and frames before and after
 # them that are solved with them: what a frame shows about others fades within some frames.
 ROUNDS, WINDOW, OVERLAP = 2, 1000, 30
@@ -118,11 +117,11 @@ class SecondPass:
     def fit_body(self, height_m: float | None) -> None:
         """Fit the tracker's body to frames of the opening and to the best frames of all stretches."""
         tracker, tracked = self.tracker, self.tracked
-        opening = tracked[: tracker.contours.init_frames : 3]
+        opening = tracked[: tracker.opening_frames : 3]
         error = np.nanmean(self.residual[tracked].sum(axis=2), axis=1)
         chosen = np.union1d(opening, _lowest(tracked, error, FIT_FRAMES - len(opening)))
         stature = height_m or tracker.body.dimensions.barefoot
-        deviation = STATURE_DEVIATION if height_m else STATURE
+        deviation = STATURE_DEVIATION if height_m else FITTED_STATURE_DEVIATION
         seen = [self._pyramid(i, 1) for i in chosen]
         fitted = tracker.fit(seen, self.poses[chosen], np.arange(len(chosen)), stature, deviation, tracker.body)
         tracker.take_body(fitted.body)
@@ -187,7 +186,7 @@ class SecondPass:
         label = tracker.coarse_grid.render(tracker.body, poses).label
         self.residual[frames] = residual = self._residual(seen, label)
         variance = tracker.variance(poses, covariance, residual)
-        self._variance[0, frames] = variance + tracker.contradiction(seen, poses)
+        self._variance[0, frames] = variance + tracker.cue_variance(seen, poses)
 
     def _residual(self, seen: Pyramid, label: NDArray[np.uint8]) -> Float:
         """Return the residuals (N, C, 2) of bodies, labels (N, C, h, w), in N frames at the finest scale."""

@@ -57,13 +57,13 @@ class SilhouetteTracker(ContourTracker[SilhouetteState]):
         self,
         rig: Rig,
         up: str,
-        config: SilhouetteSettings | None = None,
+        settings: SilhouetteSettings | None = None,
         line_search: SearchSettings = LINE_SEARCH,
         solver: GaussNewtonSettings = SOLVER,
         fps: float = 15.0,
         seed: int = 0,
     ) -> None:
-        super().__init__(rig, up, config or SilhouetteSettings(), fps, line_search, solver, seed)
+        super().__init__(rig, up, settings or SilhouetteSettings(), fps, line_search, solver, seed)
         self.stages = tuple(f"scale_{i}" for i in reversed(range(solver.scales)))
         self._pose = self._previous = np.zeros(len(self.pose_names))
         self._lost_for = 0
@@ -76,11 +76,11 @@ class SilhouetteTracker(ContourTracker[SilhouetteState]):
 
     def step(self, frame: Frame) -> Estimate:
         watch = Stopwatch()
-        config = self.contours
+        settings = self.settings
         seen = self.see(blind(frame))
         pyramid = seen.pyramid
         watch.lap("masks_clean")
-        start = self._pose + config.prediction * (self._pose - self._previous)
+        start = self._pose + settings.prediction * (self._pose - self._previous)
         settled = self.settle(pyramid, start[None])
         pose = settled.states[0]
         watch.lap("optimise")
@@ -88,11 +88,11 @@ class SilhouetteTracker(ContourTracker[SilhouetteState]):
             pose = self.improved(seen, pose)
         error = float(self.mean_residual(pyramid, pose[None], frame.uncertain)[0])
         # after a loss a pose near the last one may fit by chance
-        due = self._lost_for > 0 if error <= config.lost_error else self._lost_for % RECOVER_EVERY == 0
+        due = self._lost_for > 0 if error <= settings.lost_error else self._lost_for % RECOVER_EVERY == 0
         if due and np.isfinite(error):
             pose = self.best(seen, pose, self.anywhere(seen, pose))
             error = float(self.mean_residual(pyramid, pose[None], frame.uncertain)[0])
-        found, origin = Match(error, config.lost_error).reason, self._origin()
+        found, origin = Match(error, settings.lost_error).reason, self._origin()
         # nobody is visible: the last pose is kept
         pose = pose if np.isfinite(error) else self._pose
         # after a loss the displacement is no motion

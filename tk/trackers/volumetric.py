@@ -86,7 +86,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
         rig: the cameras.
         volume: the working volume.
         up: the world axis that points up.
-        config: all settings.
+        settings: all settings.
 
     Raises:
         VolumeError: no two cameras see the volume.
@@ -109,13 +109,13 @@ class VolumetricTracker(Stateful[VolumetricState]):
         """Return a new tracker with the settings of this method."""
         return cls(setup.rig, setup.volume, setup.up, settings, fps=setup.fps)
 
-    def __init__(self, rig: Rig, volume: Volume, up: str, config: Settings, fps: float = 15.0) -> None:
-        self.config = config
-        self.scale, self.iterations = points_and_iterations(config.effort)
+    def __init__(self, rig: Rig, volume: Volume, up: str, settings: Settings, fps: float = 15.0) -> None:
+        self.settings = settings
+        self.scale, self.iterations = points_and_iterations(settings.effort)
         self.up = up
         self.rig = rig
-        self.hull = VisualHull(rig, VoxelGrid.cover(volume, config.voxels))
-        self._finder = ContourFinder(rig, up, config.silhouette, fps, seed=config.seed)
+        self.hull = VisualHull(rig, VoxelGrid.cover(volume, settings.voxels))
+        self._finder = ContourFinder(rig, up, settings.silhouette, fps, seed=settings.seed)
         skeleton = build_skeleton(AVERAGE_BODY, up, paper=True)
         self.pose_names, self.pose_units = skeleton.names, skeleton.units
         self.skin: SuperellipsoidBody
@@ -160,7 +160,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
 
     def _build(self) -> None:
         self.skin = build_superellipsoid_body(self.body, self.up)
-        terms, scale = self.config.volumetric, self.scale
+        terms, scale = self.settings.volumetric, self.scale
         edges = ContourTerm(self.skin, self.rig, terms.edge_weight, scale) if terms.edge_weight > 0 else None
         self._objective = BodyObjective(self.skin, terms.coverage_weight, edges, scale)
 
@@ -169,7 +169,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
     def step(self, frame: Frame) -> Estimate:
         """Track the next frame."""
         watch = Stopwatch()
-        config = self.config
+        settings = self.settings
         # the visual hull and its coloured surface (section 4.1)
         self.hull.update(frame.masks)
         watch.lap("hull")
@@ -179,12 +179,12 @@ class VolumetricTracker(Stateful[VolumetricState]):
             return self._nothing_seen(frame, surface, watch)
         # (1) colour segmentation (section 6.1.3)
         fits = np.full(len(surface), -1, np.int64)
-        if config.volumetric.colors:
+        if settings.volumetric.colors:
             fits = self._appearance.segment(surface.colors, surface.seen)
         index = self._index(surface, fits)
         watch.lap("colour")
         # one generator per frame: a resumed run draws the same samples as an uninterrupted run
-        rng = np.random.default_rng([config.seed, frame.index])
+        rng = np.random.default_rng([settings.seed, frame.index])
         problem = FrameObjective(self._objective, index, rng, images=frame.images)
         # (2) all degrees of freedom at ε₁, (3) five chains at ε₂ (section 6.4)
         result = self.optimise(problem, self._starts(surface))
@@ -292,7 +292,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
             joints=self.skin.skeleton.joints(self._pose),
             origin=Status.TRACKED,
             found=Reason.NOBODY,
-            objective=1.0 + self.config.volumetric.coverage_weight,
+            objective=1.0 + self.settings.volumetric.coverage_weight,
             iterations=np.zeros(len(self.stages), np.int32),
             timing=watch.laps,
             surface=surface,

@@ -20,6 +20,7 @@ from tk.model.body.body_points import LANDMARKS
 from tk.model.body.cone_body import SHAPE_NUMBERS, build_cone_body
 from tk.model.body.gait_poses import standing_pose, walking_pose
 from tk.model.body.skeleton import JOINTS, SEGMENTS
+from tk.model.cues.cue import information
 from tk.model.cues.landmarks import NAME
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Views
@@ -170,7 +171,7 @@ def test_part_transforms_of_many_poses_follow_the_skeleton(up):
 
 def test_lengths_of_a_known_body_are_recovered(monkeypatch):
     """Silhouettes without noise: an edgel's error is below a pixel."""
-    monkeypatch.setattr(body_fit, "INFORMATION", 1.0 / (0.5**2 * 10.0))
+    monkeypatch.setattr(body_fit, "BUNDLE_INFORMATION", information(0.5))
     # the wrist hardly shows, so forearm and hand keep their lengths
     true = scaled(AVERAGE.dimensions, thigh=0.95, calf=1.05, upper_arm=1.05, thigh_radius=1.1)
     body = build_cone_body(true)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from tests.model.figures import BODY
 from tk.model.body.gait_poses import standing_pose, walking_pose
-from tk.model.body.limb_candidates import DISTINCT_M, LIMBS, exchanged, limbs_of, pairs, turned
+from tk.model.body.limb_candidates import DISTINCT_M, LIMBS, exchanged_limbs, limbs_of, pairs, turned
 from tk.model.body.skeleton import JOINTS
 
 SKELETON = BODY.skeleton
@@ -104,7 +104,7 @@ def test_exchanged_legs_are_at_each_other_s_places_within_the_limits(phase):
     skeleton = BODY.skeleton
     _, (left, right) = pairs(limbs_of(BODY))
     pose = walking_pose(skeleton, phase)
-    result = exchanged(pose, [(left, right)])[0]
+    result = exchanged_limbs(pose, [(left, right)])[0]
     before, after = skeleton.joints(pose), skeleton.joints(result)
     moved = left.joints + right.joints
     assert np.linalg.norm(after[moved] - before[right.joints + left.joints], axis=1).max() < 0.06

@@ -16,8 +16,8 @@ from tk.kernels.cones import CONE
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_parameters import BodyFamily, shapes_of
 from tk.model.body.cone_body import SHAPE_NUMBERS, build_cone_body, group_of
-from tk.model.cameras.agreement import CAMERA_SEARCH, camera_agreement
-from tk.model.cameras.bundle import TrackedPoses, camera_rows, choose_frames, farthest
+from tk.model.cameras.agreement import camera_agreement
+from tk.model.cameras.bundle import TrackedPerson, bundle_frames, camera_rows, farthest
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import closest_to_lines
 from tk.model.cameras.people_bundle import PeopleBundle
@@ -32,7 +32,6 @@ from tk.model.cameras.refinement import (
     world_motions,
 )
 from tk.model.masks.silhouettes import Views
-from tk.run.delays import TrackedPerson
 from tk.run.refinement import refine_rig
 
 RIG = ring_of_cameras(4, width=320, height=400)
@@ -70,15 +69,15 @@ def in_time() -> MaskStore:
     return rendered()
 
 
-def tracked(poses: np.ndarray | None = None, usable: slice = slice(None)) -> TrackedPoses:
+def tracked(store: MaskStore, poses: np.ndarray | None = None, usable: slice = slice(None)) -> TrackedPerson:
     """All frames; only those of the slice are usable."""
     sure = np.zeros(FRAMES, bool)
     sure[usable] = True
-    return TrackedPoses(np.arange(FRAMES), motion() if poses is None else poses, sure)
+    return TrackedPerson(BODY, store.get, np.arange(FRAMES), motion() if poses is None else poses, sure)
 
 
 def frames(store: MaskStore, rig: Rig):
-    return choose_frames(store.get, Views(rig), BODY.skeleton, tracked(), FRAMES, SCALES, True)
+    return bundle_frames(tracked(store), Views(rig), FRAMES, SCALES, True)
 
 
 def disturbed(camera: Camera, rng: np.random.Generator, deg: float = 0.25, metres: float = 0.01) -> Camera:
@@ -172,7 +171,7 @@ def test_body_family_begins_at_the_body():
     ellipsoid = [group_of(p.name) for p in BODY.parts if p.kind != CONE]
     change[[BODY.shape_groups.index(name) for name in ellipsoid], 2] = 0.0  # nothing tapers there
     np.testing.assert_allclose(shapes_of(body), change, atol=2e-4)
-    family = BodyFamily.around(body, 0.03)
+    family = BodyFamily.around(body)
     again = family.build(family.start)
     for one, other in zip(again.parts, body.parts, strict=True):
         np.testing.assert_allclose(one.shape, other.shape, rtol=2e-3)
@@ -223,7 +222,7 @@ def test_focal_lengths_are_refined():
 @pytest.mark.parametrize("late", [(0, 0, 1, 0), (0, 0.4, 0, 0)])
 def test_delays_of_videos_are_estimated(late):
     store = rendered(late)
-    done = refine_rig([TrackedPerson(BODY, store.get, tracked())], RIG, QUICK)
+    done = refine_rig([tracked(store)], RIG, QUICK)
     assert done is not None
     np.testing.assert_allclose(done.offset_frames, late, atol=0.12)
     assert (done.offset_sigma_frames < 0.2).all()
@@ -233,7 +232,7 @@ def test_a_refinement_that_begins_at_another_finds_the_same_cameras():
     """The first one has found a video that is late by a frame; the second one has its other frames."""
     store, late = rendered((0, 0, 1, 0)), np.array([0, 0, 1, 0])
     first = refine_cameras([(BODY, frames(store, RIG))], RIG, QUICK)
-    moved = choose_frames(store.get, Views(RIG), BODY.skeleton, tracked(), FRAMES, SCALES, True, late)
+    moved = bundle_frames(tracked(store), Views(RIG), FRAMES, SCALES, True, late)
     fresh, again = (refine_cameras([(BODY, moved)], RIG, QUICK, *begun) for begun in ((), (first, late)))
     np.testing.assert_allclose(again.offset_frames, fresh.offset_frames, atol=0.02)
     assert max(turn_between(a, b) for a, b in zip(again.rig, fresh.rig, strict=True)) < 0.01
@@ -242,7 +241,7 @@ def test_a_refinement_that_begins_at_another_finds_the_same_cameras():
 
 
 def test_too_few_usable_frames_give_none():
-    assert refine_rig([TrackedPerson(BODY, in_time().get, tracked(usable=slice(3, 8)))], RIG, QUICK) is None
+    assert refine_rig([tracked(in_time(), usable=slice(3, 8))], RIG, QUICK) is None
 
 
 def test_agreement_names_the_inconsistent_and_the_late_camera():
@@ -266,8 +265,8 @@ def test_two_cameras_of_which_one_is_turned_sideways_contradict_each_other(turne
     met = [closest_to_lines(wrong.centers, np.array(pair)) for pair in zip(*rays, strict=True)]
     poses = motion().copy()
     poses[:, [BODY.skeleton.names.index(f"torso_{axis}") for axis in "xyz"]] += np.array(met) - place
-    seen = choose_frames(in_time().get, Views(wrong), BODY.skeleton, tracked(poses), FRAMES, SCALES, True)
-    contradiction = camera_agreement([(BODY, seen)], wrong).contradiction
+    seen = bundle_frames(tracked(in_time(), poses), Views(wrong), FRAMES, SCALES, True)
+    contradiction = camera_agreement([(BODY, seen)], wrong).size_contradiction
     assert ("larger than" in contradiction) == (turned_deg != 0), contradiction
 
 
@@ -288,9 +287,7 @@ def test_cameras_are_refined_from_all_people():
     seen = frames(in_time(), PERTURBED)
     people = [(BODY, seen[:4]), (build_cone_body(BodyDimensions.from_stature(1.6)), seen[4:])]
     sigmas = {"turn": 0.01, "move": 0.01}
-    both, *alone = (
-        PeopleBundle(some, 0.03, PERTURBED, CAMERA_SEARCH, sigmas) for some in (people, people[:1], people[1:])
-    )
+    both, *alone = (PeopleBundle(some, PERTURBED, sigmas) for some in (people, people[:1], people[1:]))
     found, *parts = (bundle.linearise(bundle.start, 1).reduced() for bundle in (both, *alone))
     own = both.cameras
     prior = np.diag(np.tile(both.sigma**-2.0, len(RIG)))

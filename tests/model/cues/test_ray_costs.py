@@ -15,7 +15,6 @@ from tk.model.body.gait_poses import walking_pose
 from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import PartColors, color_bins
 from tk.model.cues.ray_costs import UNCERTAIN_COST, Evidence, RayGrid, unpacked
-from tk.model.masks.silhouettes import share_wrong
 
 RIG = ring_of_cameras(3, width=120, height=160)
 FINE = RayGrid(RIG, 160)
@@ -26,6 +25,11 @@ OTHER[:2] += 0.08
 POSES = np.stack([POSE, OTHER])
 DRAWN = draw_silhouettes(BODY, RIG, POSES)
 MASKS = DRAWN[0]
+
+
+def share_wrong(drawn, masks):
+    """E_S (V,) as the paper defines it."""
+    return ((drawn > 0) ^ (masks > 0)).sum(axis=(1, 2)) / (masks > 0).sum(axis=(1, 2))
 
 
 def by_view(evidence, poses=POSES):

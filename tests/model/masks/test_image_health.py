@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from tk.model.masks.image_health import MOVED, ImageHealth, contradiction, described, sampled
+from tk.model.masks.image_health import MOVED, ImageHealth, described, mask_contradiction, sampled
 
 C, H, W = 4, 96, 128
 
@@ -28,7 +28,7 @@ def test_healthy_images_have_no_reason() -> None:
 
 
 def complaint(images: Sequence[np.ndarray], masks: Sequence[np.ndarray]) -> str:
-    return contradiction(pairwise(map(sampled, images, masks))) or ""
+    return mask_contradiction(pairwise(map(sampled, images, masks))) or ""
 
 
 def test_masks_that_never_change_are_contradicted_only_if_somebody_moves() -> None:

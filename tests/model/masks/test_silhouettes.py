@@ -1,4 +1,4 @@
-"""Cleaning, scales and E_S of masks."""
+"""Cleaning and scales of masks."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from tests.model.ring import ring_of_cameras
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.model.body.gait_poses import walking_pose
-from tk.model.masks.silhouettes import Views, clean, share_wrong
+from tk.model.masks.silhouettes import Views, clean
 
 RIG = ring_of_cameras(2, width=101, height=133)
 BODY = build_cone_body(BodyDimensions.from_stature(1.7))
@@ -41,13 +41,3 @@ def test_pyramid_halves_images_of_any_size():
     assert pyramid.sizes[2].tolist() == [[26, 34]] * 2
     fine = MASKS[:, :132, :100].astype(float).reshape(2, 66, 2, 50, 2).mean(axis=(2, 4))
     assert np.abs(pyramid.masks[1][:, :66, :50] - fine).max() <= 1
-
-
-def test_share_of_wrong_pixels_follows_the_papers_definition():
-    other = POSE.copy()
-    other[0] += 0.1
-    drawn = draw_silhouettes(BODY, RIG, other[None])[0]
-    expected = ((drawn > 0) ^ (MASKS > 0)).sum(axis=(1, 2)) / (MASKS > 0).sum(axis=(1, 2))
-    np.testing.assert_allclose(share_wrong(drawn, MASKS), expected)
-    assert (expected > 0.1).all() and not share_wrong(MASKS, MASKS).any()
-    assert np.isinf(share_wrong(MASKS, 0 * MASKS)).all()

@@ -19,7 +19,7 @@ from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_parameters import BodyFamily
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.bundle import (
-    INFORMATION,
+    BUNDLE_INFORMATION,
     LONGEST_STEP,
     SEGMENT_M,
     SPACING_PX,
@@ -87,7 +87,7 @@ def fit_body(
             [BundleFrame(pyramid, pose, np.zeros_like(pose)) for pyramid, pose in zip(pyramids, poses, strict=True)],
             replace(settings, spacing_px=SPACING_PX),
             {},
-            INFORMATION / max(len(poses) / INFORMATIVE_FRAMES, 1.0),
+            BUNDLE_INFORMATION / max(len(poses) / INFORMATIVE_FRAMES, 1.0),
             segment_m=segment_m,
         )
 

@@ -45,6 +45,8 @@ _END = (*_WIDTHS, 0.1, 0.005, 0.005, 0.02, 0.01)
 _HEAD = (*_WIDTHS, 0.1, 0.005, _FIXED, 0.02, _FIXED)
 _SHAPES = {"hand_": _END, "foot_": _END, "head": _HEAD}
 
+# Prior standard deviation of the logarithm of the stature about that of a body that other frames have shown.
+FITTED_STATURE_DEVIATION = 0.03
 # Difference of a dimension's logarithm for its derivative: curvature then changes the derivative by 1e-6, float64's
 # rounding by less.
 _STEP = 1e-6
@@ -71,9 +73,9 @@ class BodyFamily:
         self._built: tuple[Float, ConeBody] | None = None
 
     @staticmethod
-    def around(body: ConeBody, stature_deviation: float) -> BodyFamily:
+    def around(body: ConeBody) -> BodyFamily:
         """Return the family whose prior is about a body's dimensions and which begins at the body."""
-        return BodyFamily(body.dimensions, stature_deviation).begun_at(body)
+        return BodyFamily(body.dimensions, FITTED_STATURE_DEVIATION).begun_at(body)
 
     def begun_at(self, body: ConeBody) -> BodyFamily:
         """Begin at a body; return the family."""

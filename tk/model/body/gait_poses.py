@@ -58,7 +58,7 @@ def neutral_pose(skeleton: Skeleton) -> Float:
     return pose
 
 
-def figures(skeleton: Skeleton, headings: int, phases: int, p_pelvis: Float, first: float = 0.0) -> Float:
+def gait_figures(skeleton: Skeleton, headings: int, phases: int, p_pelvis: Float, first: float = 0.0) -> Float:
     """Return poses (B, D) with the pelvis at ``p_pelvis`` (3,): walking phases, standing and Da Vinci pose at headings.
 
     Headings are evenly spaced, beginning with ``first``, radians.

@@ -58,7 +58,7 @@ def pose_of_joints(skeleton: Skeleton, rows: NDArray[np.int64], targets: Float) 
 
     The best of several headings is returned.
     """
-    start = figures(skeleton, np.zeros(3))
+    start = resting_figures(skeleton, np.zeros(3))
     start[:, :3] += targets.mean(axis=0) - skeleton.joints(start[0])[rows].mean(axis=0)
     D = start.shape[1]
     precision = np.where(skeleton.prismatic, 0.0, np.pi**-2.0)  # half a turn, for what the joints leave open
@@ -83,7 +83,7 @@ def pose_of_joints(skeleton: Skeleton, rows: NDArray[np.int64], targets: Float) 
     return np.asarray(poses[np.argmin(cost)])
 
 
-def figures(skeleton: Skeleton, p_pelvis: Float) -> Float:
+def resting_figures(skeleton: Skeleton, p_pelvis: Float) -> Float:
     """Return poses (B, D) to begin from, standing and seated at several headings, with the pelvis at a point (3,)."""
     rest = neutral_pose(skeleton)
     hanging = shoulder_angles(np.array([0.0, 0.2, -0.98]))

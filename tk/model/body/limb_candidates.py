@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tk.kernels.cone_arrays import ConeArrays
 from tk.model.body.cone_body import ConeBody
 from tk.model.body.joints import CHAINS, JOINTS, LEANS, LIMBS
-from tk.model.body.skeleton import Skeleton
+from tk.model.body.skeleton import Skeleton, distinct
 
 Float = NDArray[np.float64]
 
@@ -56,21 +56,11 @@ class Limb:
         """Return (C, D) the cheapest different poses of the limb (:data:`DISTINCT_M`), at most ``count``."""
         best = np.argsort(cost, kind="stable")
         best = best[np.isfinite(cost[best])]
-        chosen: list[int] = []
+        chosen = np.zeros(0, np.int64)
         for many in (5 * count, 20 * count):  # the cheapest are mostly neighbours of each other
             if len(chosen) < count:
-                chosen = distinct(self.skeleton.joints(poses[best[:many]])[:, self.joints], count)
+                chosen = distinct(self.skeleton.joints(poses[best[:many]])[:, self.joints], DISTINCT_M, count)
         return np.asarray(poses[best[chosen]])
-
-
-def distinct(joints: Float, count: int) -> list[int]:
-    """Return the indices of the first positions (N, J, 3) that differ from each other by :data:`DISTINCT_M`."""
-    free = np.ones(len(joints), np.bool_)
-    chosen: list[int] = []
-    while len(chosen) < count and free.any():
-        chosen.append(int(np.argmax(free)))
-        free &= np.linalg.norm(joints - joints[chosen[-1]], axis=-1).max(axis=-1) > DISTINCT_M
-    return chosen
 
 
 def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
@@ -106,7 +96,7 @@ def pairs(limbs: Sequence[Limb]) -> list[tuple[Limb, ...]]:
     return [tuple(pair) for pair in kinds if len(pair) == 2]
 
 
-def exchanged(poses: Float, both: Sequence[tuple[Limb, ...]]) -> Float:
+def exchanged_limbs(poses: Float, both: Sequence[tuple[Limb, ...]]) -> Float:
     """Return poses (N, ..., D), one for each of N pairs of limbs: poses (..., D) with their joints at each other's
     places as nearly as the limits allow.
 

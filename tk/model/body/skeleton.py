@@ -339,6 +339,18 @@ def arm_elevation(first: ArrayLike, second: ArrayLike, by: int | None = None) ->
     return np.asarray(a * np.cos(second) * np.sin(first) + b * np.sin(second))
 
 
+def distinct(points: Float, least_m: float, count: int | None = None) -> NDArray[np.int64]:
+    """Return the indices of the first of the points (N, ..., 3), ``count`` at most, that differ from all chosen before
+    them by more than ``least_m`` in one of their points, metres."""
+    free = np.ones(len(points), np.bool_)
+    chosen: list[int] = []
+    while free.any() and len(chosen) != count:
+        chosen.append(int(np.argmax(free)))
+        away = np.linalg.norm(points - points[chosen[-1]], axis=-1)
+        free &= away.reshape(len(points), -1).max(axis=1) > least_m
+    return np.array(chosen, np.int64)
+
+
 def convert_poses(poses: Float, source: Skeleton, target: Skeleton) -> Float:
     """Return poses (..., D) of one skeleton as poses (..., D') of another: angles by name, 0 where the source has none.
 

@@ -14,8 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.line_search import SearchSettings
-from tk.model.cameras.bundle import SPACING_PX
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.people_bundle import Filmed, PeopleBundle
 from tk.optim.trajectory import gauge_projection
@@ -36,12 +34,6 @@ _STEP_M = 1e-4
 INCONSISTENT_DEG, LATE_FRAMES, SIGNIFICANT = 0.06, 0.2, 3.0
 # Two cameras contradict each other if they show the person larger and smaller by more than this share, significantly.
 SIZE = 0.005
-# An edge's weight falls to a quarter at robust_px: less than in the tracker's search, because a camera can do without
-# the edges of folds, shadows and hands.
-CAMERA_SEARCH = SearchSettings(spacing_px=SPACING_PX, robust_px=3.0)
-# Prior standard deviation of the logarithm of the stature about that of the given body: the cameras determine the scale
-# better than the body does.
-SCALE_DEVIATION = 0.03
 
 
 @dataclass(frozen=True)
@@ -76,7 +68,7 @@ class CameraAgreement:
             return (size > LATE_FRAMES) & (size > SIGNIFICANT * self.offset_sigma_frames)
 
     @property
-    def contradiction(self) -> str:
+    def size_contradiction(self) -> str:
         """Why two cameras cannot be used together, one line; empty if they can, or if there are more."""
         if not (np.abs(self.size) > np.maximum(SIZE, SIGNIFICANT * self.size_sigma)).any():
             return ""
@@ -92,7 +84,7 @@ def camera_agreement(people: Sequence[Filmed], rig: Rig) -> CameraAgreement:
 
     Args:
         people: the bodies, in a world in which z is up, with frames of
-            :func:`tk.model.cameras.bundle.choose_frames`; 20 are enough.
+            :func:`tk.model.cameras.bundle.bundle_frames`; 20 are enough.
         rig: C cameras.
 
     Raises:
@@ -102,7 +94,7 @@ def camera_agreement(people: Sequence[Filmed], rig: Rig) -> CameraAgreement:
     if not people:
         raise ValueError("no frames to compare the cameras in")
     C = len(rig)
-    bundle = PeopleBundle(people, SCALE_DEVIATION, rig, CAMERA_SEARCH, _SIGMA_OF_TWO if C == 2 else _SIGMA)
+    bundle = PeopleBundle(people, rig, _SIGMA_OF_TWO if C == 2 else _SIGMA)
     found = bundle.linearise(bundle.start, 0).reduced()
     body, frames = people[0]
     modes = _gauge_modes(rig, body.skeleton.joints(frames[0].pose)[0], len(bundle.sigma))

@@ -22,8 +22,10 @@ from numpy.typing import NDArray
 from tk.kernels.line_search import SearchSettings
 from tk.kernels.silhouette import Edgels, find_edgels
 from tk.model.body.body_parameters import BodyFamily
-from tk.model.body.skeleton import SEGMENTS, Skeleton
+from tk.model.body.cone_body import ConeBody
+from tk.model.body.skeleton import SEGMENTS
 from tk.model.cameras.camera import Camera, Rig
+from tk.model.cues.cue import information
 from tk.model.cues.landmarks import NAME as MARKED
 from tk.model.cues.landmarks import LandmarkCue
 from tk.model.masks.silhouettes import Pyramid, Views
@@ -32,11 +34,9 @@ from tk.optim.trajectory import Equations
 Float = NDArray[np.float64]
 
 # Standard deviation of an edgel's distance, pixels: ragged masks, and shapes that no cone has.
-EDGE_NOISE_PX = 3.0
-# Edgels within this length of a contour err together, pixels. Only its product with EDGE_NOISE_PX² counts.
-CORRELATION_PX = 10.0
-# Information of one pixel of contour, 1/px².
-INFORMATION = 1.0 / (EDGE_NOISE_PX**2 * CORRELATION_PX)
+SHAPE_NOISE_PX = 3.0
+#: information of one pixel of contour
+BUNDLE_INFORMATION = information(SHAPE_NOISE_PX)
 # Between samples of a contour, pixels: no more than these are independent, by CORRELATION_PX.
 SPACING_PX = 6.0
 # Standard deviation of a degree of freedom about the given pose, radians or metres; of waist and ankles about zero,
@@ -57,9 +57,11 @@ CAMERA_PARAMETERS = {"shift": 2, "turn": 3, "move": 3, "focal": 1, "offset": 1}
 
 
 @dataclass(frozen=True)
-class TrackedPoses:
-    """Poses of a person in some frames of a recording."""
+class TrackedPerson:
+    """A person who was tracked in some frames of a recording, in a world in which z is up."""
 
+    body: ConeBody
+    masks: Callable[[int], NDArray[np.uint8]]  # (C, H, W) of a frame
     frames: NDArray[np.int64]  # (F,) number of each frame, ascending
     poses: Float  # (F, D)
     usable: NDArray[np.bool_]  # (F,) whether the pose is reliable
@@ -119,7 +121,7 @@ class ContourBundle:
         frames: Sequence[BundleFrame],
         settings: SearchSettings,
         sigmas: Mapping[str, float],
-        information: float = INFORMATION,
+        information: float = BUNDLE_INFORMATION,
         segment_m: float | None = SEGMENT_M,
     ) -> None:
         """See the attributes.
@@ -128,7 +130,7 @@ class ContourBundle:
             family, rig, frames: as above.
             settings: of the edge search.
             sigmas: standard deviation of each camera parameter that may change; empty if the cameras are known.
-            information: of one pixel of contour, 1/px².
+            information: see :func:`~tk.model.cues.cue.information`.
             segment_m: standard deviation of a segment's position about the skeleton's, metres; None: it is fixed.
         """
         self.family, self.rig, self.frames = family, rig, frames
@@ -298,11 +300,9 @@ def residual_px(contours: Sequence[Contours], count: int) -> Float:
     return np.sqrt(square / np.where(weight > 0, weight, np.nan))
 
 
-def choose_frames(
-    masks: Callable[[int], NDArray[np.uint8]],
+def bundle_frames(
+    person: TrackedPerson,
     views: Views,
-    skeleton: Skeleton,
-    tracked: TrackedPoses,
     count: int,
     scales: int,
     cleaning: bool,
@@ -312,27 +312,25 @@ def choose_frames(
     them.
 
     Args:
-        masks: (C, H, W) of a frame.
+        person: with the frames to choose from.
         views: the C cameras.
-        skeleton: of the body.
-        tracked: the frames to choose from.
         count: largest number of frames.
         scales: of the pyramids.
         cleaning: whether the masks are cleaned first.
         late: (C,) whole frames by which a camera's video is late: its frame k - late goes with frame k of the other
             cameras. None: by none.
     """
-    frames, poses, usable = tracked.frames, tracked.poses, tracked.usable
+    frames, poses, usable = person.frames, person.poses, person.usable
     delays = [0] * len(views.rig) if late is None else late.tolist()
     known = set(frames.tolist())
     inner = np.zeros(len(frames), bool)
     inner[1:-1] = usable[:-2] & usable[1:-1] & usable[2:] & (frames[2:] - frames[:-2] == 2)
     inner &= [all(frame - n in known for n in delays) for frame in frames.tolist()]
     rows = np.flatnonzero(inner)
-    rows = rows[farthest(skeleton.joints(poses[rows]), count)]
+    rows = rows[farthest(person.body.skeleton.joints(poses[rows]), count)]
     chosen = []
     for i in rows:
-        frame_set = np.stack([masks(int(frames[i]) - n)[c] for c, n in enumerate(delays)])
+        frame_set = np.stack([person.masks(int(frames[i]) - n)[c] for c, n in enumerate(delays)])
         velocity = 0.5 * (poses[i + 1] - poses[i - 1])
         chosen.append(BundleFrame(views.pyramid(frame_set, scales, cleaning), poses[i], velocity))
     return chosen

@@ -227,12 +227,6 @@ class Rig:
         """Return the length in pixels of a metre across the view at a world point (3,); the median of the cameras."""
         return float(np.median([camera.pixels_per_metre(point) for camera in self.cameras]))
 
-    def project(self, p_world: ArrayLike) -> Float:
-        """Return the pixels (..., C, N, 2) of world points (..., N, 3), see :meth:`Camera.project`."""
-        points = np.asarray(p_world, np.float64)
-        pixels = np.stack([camera.project(points)[0] for camera in self.cameras])  # (C, ... N, 2)
-        return np.moveaxis(pixels.reshape(len(self), *points.shape[:-1], 2), 0, -3)
-
     @property
     def reductions(self) -> tuple[int, ...]:
         """(C,) each camera's :attr:`Camera.reduction`."""

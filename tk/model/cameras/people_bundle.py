@@ -12,11 +12,15 @@ from numpy.typing import NDArray
 from tk.kernels.line_search import SearchSettings
 from tk.model.body.body_parameters import BodyFamily
 from tk.model.body.cone_body import ConeBody
-from tk.model.cameras.bundle import BundleFrame, BundleState, ContourBundle, Contours
+from tk.model.cameras.bundle import SPACING_PX, BundleFrame, BundleState, ContourBundle, Contours
 from tk.model.cameras.camera import Rig
 from tk.optim.trajectory import Equations
 
 Float = NDArray[np.float64]
+
+# An edge's weight falls to a quarter at robust_px: less than in the tracker's search, because a camera can do without
+# the edges of folds, shadows and hands.
+CAMERA_SEARCH = SearchSettings(spacing_px=SPACING_PX, robust_px=3.0)
 
 Filmed = tuple[ConeBody, Sequence[BundleFrame]]
 """A tracked body, and frames of it."""
@@ -29,9 +33,8 @@ class PeopleBundle:
 
     Args:
         people: P bodies, in a world in which z is up, with their frames.
-        scale: standard deviation of the logarithm of a stature about that of the given body.
         rig: the C cameras.
-        settings, sigmas: as of :class:`ContourBundle`.
+        sigmas: as of :class:`ContourBundle`.
 
     Attributes:
         bundles: of each person.
@@ -39,11 +42,9 @@ class PeopleBundle:
         sigma, parameters: as of :class:`ContourBundle`.
     """
 
-    def __init__(
-        self, people: Sequence[Filmed], scale: float, rig: Rig, settings: SearchSettings, sigmas: Mapping[str, float]
-    ) -> None:
+    def __init__(self, people: Sequence[Filmed], rig: Rig, sigmas: Mapping[str, float]) -> None:
         self.bundles = [
-            ContourBundle(BodyFamily.around(body, scale), rig, frames, settings, sigmas) for body, frames in people
+            ContourBundle(BodyFamily.around(body), rig, frames, CAMERA_SEARCH, sigmas) for body, frames in people
         ]
         first = self.bundles[0]
         self.rig, self.cameras, self.sigma, self.parameters = rig, first.cameras, first.sigma, first.parameters

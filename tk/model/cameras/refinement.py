@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
-from tk.model.cameras.agreement import CAMERA_SEARCH, OFFSET_FRAMES, SCALE_DEVIATION
+from tk.model.cameras.agreement import OFFSET_FRAMES
 from tk.model.cameras.bundle import CAMERA_PARAMETERS, LONGEST_STEP, residual_px
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.people_bundle import Filmed, PeopleBundle, States
@@ -102,7 +102,7 @@ def refine_cameras(
     sigmas |= ({"focal": FOCAL} if config.focal else {}) | ({"offset": OFFSET_FRAMES} if config.offsets else {})
     present = tuple(bool(frames) for _, frames in people)
     people = [(body, frames) for body, frames in people if frames]
-    bundle = PeopleBundle(people, SCALE_DEVIATION, rig, CAMERA_SEARCH, sigmas)
+    bundle = PeopleBundle(people, rig, sigmas)
     C, sigma = len(rig), np.tile(bundle.sigma, len(rig))
     others = np.full(bundle.size - len(sigma), np.inf)
     start, coarse = bundle.start, COARSE_ROUNDS

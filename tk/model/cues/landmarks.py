@@ -32,7 +32,7 @@ from tk.kernels.mask_values import PERSON
 from tk.model.body.anthropometry import AVERAGE_BODY
 from tk.model.body.body_points import LANDMARKS, POINTS, SEGMENT
 from tk.model.body.cone_body import ConeBody
-from tk.model.body.initial_pose import figures
+from tk.model.body.initial_pose import resting_figures
 from tk.model.body.joints import HIPS, JOINTS, SHOULDERS, side_of
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.triangulation import triangulate_joints
@@ -64,8 +64,7 @@ LEAST_VISIBLE, LEAST_OVERLAP = 0.2, 0.2
 # Factors of the standard deviations with which a proposal minimises the landmarks' cost, two steps each: a pose that
 # is far away is attracted, too. Largest change of an angle in a step, radians.
 WIDENED, LONGEST_STEP = (16.0, 8.0, 4.0, 2.0, 1.0), 0.6
-# Weight of the landmarks in the contours' equations: these count the edgels of a segment as independent, but clothes
-# and wrong pieces of a mask displace all of them together.
+# Weight of the landmarks in the contours' equations of a frame, see tk.model.cues.cue.
 WEIGHT = 5.0
 # Share of the landmarks' likelihood that counts: a network's errors in neighbouring landmarks go together.
 INDEPENDENT = 0.5
@@ -285,7 +284,7 @@ def propose(rig: Rig, body: ConeBody, seen: Float, p_near: Float) -> Float:
     point (3,), by Gauss-Newton, at first with wide distributions.
     """
     skeleton = body.skeleton
-    start = figures(skeleton, p_near)
+    start = resting_figures(skeleton, p_near)
     prior = Quadratic.about(start, np.where(skeleton.prismatic, 1.0, np.pi) ** -2.0)
     poses, cue = start, LandmarkCue(rig, body, seen)
     for factor in WIDENED:

@@ -46,7 +46,6 @@ class VisualHull:
     """
 
     def __init__(self, rig: Rig, grid: VoxelGrid) -> None:
-        self.rig = rig
         self.grid = grid
         self._tables = build_tables(rig, grid)
         self._mask_shape = (len(rig), *rig.frame_shape)

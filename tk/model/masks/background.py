@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tk.errors import CaptureError
+from tk.model.reduced_images import every
 
 Images = NDArray[np.uint8]
 Float = NDArray[np.float32]
@@ -89,7 +90,7 @@ def reduced(images: Images, factor: int, out: Images | None = None) -> Images:
 def samples(images: NDArray[Any]) -> NDArray[Any]:
     """Return pixels of images (C, h, w, K) on a coarse grid of about thirty rows, as (C, K, N)."""
     step = max(min(images.shape[1:3]) // 30, 1)
-    grid = images[:, step // 2 :: step, step // 2 :: step]
+    grid = every(images, images.shape[1:3], step)
     return np.ascontiguousarray(np.moveaxis(grid, -1, 1)).reshape(len(images), images.shape[3], -1)
 
 

@@ -152,8 +152,8 @@ IMAGE_FAULTS: Mapping[str, tuple[str, Callable[[ImageHealth, _Look], NDArray[np.
 
 
 def sampled(images: NDArray[np.uint8], masks: NDArray[np.uint8]) -> Sampled:
-    """Return what :func:`contradiction` needs of a frame: images (C, h, w, 3), of the masks' size or reduced, and masks
-    (C, H, W)."""
+    """Return what :func:`mask_contradiction` needs of a frame: images (C, h, w, 3), of the masks' size or reduced, and
+    masks (C, H, W)."""
     return _thinned(images, masks).astype(np.int16), _thinned(masks, masks) >= PERSON
 
 
@@ -162,7 +162,7 @@ def _thinned(images: NDArray[np.uint8], masks: NDArray[np.uint8]) -> NDArray[np.
     return every(images, masks.shape[1:], max(1, masks.shape[1] // _ROWS))
 
 
-def contradiction(pairs: Iterable[tuple[Sampled, Sampled]]) -> str | None:
+def mask_contradiction(pairs: Iterable[tuple[Sampled, Sampled]]) -> str | None:
     """Return why masks do not belong to their images, or None if nothing contradicts it.
 
     An outline moves with the person, so an image changes where its mask changes. The measure is the probability that it

@@ -23,6 +23,7 @@ from tk.model.cameras.common_view import LEAST_INFORMATION, depth_information
 from tk.model.cameras.volume import Volume, VoxelGrid
 from tk.model.hull.coarse import Hull, Voxels, dilated
 from tk.model.masks.tangency import Outline, Tangency, tangency
+from tk.model.reduced_images import every
 
 Float = NDArray[np.float64]
 Masks = NDArray[np.uint8]
@@ -150,12 +151,12 @@ class MaskAgreement:
 
     def small(self, masks: Masks) -> Bool:
         """Return (C, h, w) every ``step``-th pixel of masks (C, H, W)."""
-        offset = self.step // 2
-        return np.asarray(masks[:, offset :: self.step, offset :: self.step] >= PERSON)
+        return np.asarray(every(masks, masks.shape[1:], self.step) >= PERSON)
 
     def possible(self, masks: Masks) -> Bool:
         """Return (C, h, w) the same, with the pixels where others may hide the person."""
-        return self.small(masks) | self.small(np.uint8(255) * (masks == OTHERS))
+        small = every(masks, masks.shape[1:], self.step)
+        return (small >= PERSON) | (small == OTHERS)
 
     def compare(self, frames: Sequence[Masks], there: Bool | None = None) -> Agreement:
         """Return the agreement over F frames of masks (C, H, W).

@@ -115,11 +115,3 @@ def _halve(levels: Sequence[Masks], crop: tuple[slice, slice], shared: bool) -> 
 def _halved(part: Masks) -> Masks:
     """Return the means (h/2, w/2) of the squares of four pixels."""
     return np.asarray(cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def share_wrong(drawn: Masks, seen: Masks) -> Float:
-    """Return E_S (V,) (eq. 12) of silhouettes (V, H, W) against masks (V, H, W), S_T; inf where the mask is empty."""
-    wrong = np.count_nonzero((drawn >= PERSON) != (seen >= PERSON), axis=(1, 2))
-    total = np.count_nonzero(seen >= PERSON, axis=(1, 2))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(total > 0, wrong / total, np.inf)

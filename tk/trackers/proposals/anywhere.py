@@ -12,9 +12,9 @@ from tk.kernels.mask_values import PERSON
 from tk.model.body import gait_poses as gait
 from tk.model.body.initial_pose import HEADINGS
 from tk.model.body.limb_candidates import DISTINCT_M
+from tk.model.body.skeleton import distinct
 from tk.model.cameras.camera import Rig
 from tk.model.masks.silhouettes import Pyramid
-from tk.trackers.hypotheses import different
 
 if TYPE_CHECKING:
     from tk.trackers.contour_finder import ContourFinder, Seen
@@ -41,7 +41,7 @@ def propose(finder: ContourFinder, seen: Seen, pose: Float | None = None) -> Flo
     skeleton, pyramid = finder.body.skeleton, seen.pyramid
     p_centroid = centroid(finder.views.rig, pyramid, seen.frame.index)
     yaw = skeleton.index("torso_yaw")
-    poses = gait.figures(skeleton, HEADINGS, PHASES, p_centroid, 0.0 if pose is None else pose[yaw])
+    poses = gait.gait_figures(skeleton, HEADINGS, PHASES, p_centroid, 0.0 if pose is None else pose[yaw])
     if pose is not None:
         moved = pose.copy()
         moved[skeleton.prismatic] = p_centroid
@@ -51,7 +51,7 @@ def propose(finder: ContourFinder, seen: Seen, pose: Float | None = None) -> Flo
         poses = finder.settle(pyramid, poses, levels).states
         order = np.argsort(seen.evidence.cost(finder.body, poses), kind="stable")
         poses = poses[order[: -(-len(poses) // share)]]
-    return np.asarray(poses[different(skeleton, poses, DISTINCT_M)[:FINALISTS]])
+    return np.asarray(poses[distinct(skeleton.joints(poses), DISTINCT_M, FINALISTS)])
 
 
 def centroid(rig: Rig, pyramid: Pyramid, index: int) -> Float:

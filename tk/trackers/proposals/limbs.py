@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from tk.kernels.raycast import Cast
 from tk.model.body.limb_candidates import Limb
-from tk.model.body.skeleton import JOINTS, Skeleton
-from tk.trackers.hypotheses import DROPPED, PROPOSED, SAME_POSE_M, different
+from tk.model.body.skeleton import JOINTS, Skeleton, distinct
+from tk.trackers.hypotheses import DROPPED, PROPOSED, SAME_POSE_M
 
 if TYPE_CHECKING:
     from tk.trackers.contour_finder import ContourFinder, Seen
@@ -141,7 +141,7 @@ def spread(skeleton: Skeleton, pose: Float, before: Float, found: Sequence[Modes
         limb = np.concatenate([before[None], one.poses])[:, one.limb.dofs]
         poses = np.repeat(pose[None], len(limb), axis=0)
         poses[:, one.limb.dofs] = limb
-        kept = different(skeleton, poses, SAME_POSE_M)
+        kept = distinct(skeleton.joints(poses), SAME_POSE_M)
         cost = np.append(0.0, one.cost)[kept]
         weight = np.exp(cost.min() - cost)  # of a person who was elsewhere, a mode may be a thousand nats likelier
         away = ((skeleton.joints(poses[kept]) - joints) ** 2).sum(axis=-1) / 3
