@@ -31,6 +31,8 @@ T = TypeVar("T")
 
 #: most bytes in memory; larger stores are on disk
 IN_MEMORY = 32_000_000
+#: frames of a sequence whose masks lie one after the other, as the second pass takes them
+TOGETHER = 16
 
 
 #: header of each record: the frame's number, the kind of the record, the number of bytes that follow, and the shape of
@@ -119,9 +121,10 @@ class MaskStore:
             raise self._no_room(error) from None
         self._places[index, kind] = (place, len(packed))
 
-    def get(self, index: int) -> Masks:
-        """Return the masks (C, H, W) of a stored frame."""
-        masks = np.zeros(self._shapes[_PERSON], np.uint8)
+    def get(self, index: int, out: Masks | None = None) -> Masks:
+        """Return the masks (C, H, W) of a stored frame, in ``out`` if it is given."""
+        masks = np.empty(self._shapes[_PERSON], np.uint8) if out is None else out
+        masks.fill(0)
         for kind, value in ((_PERSON, 255), (_OTHERS, OTHERS)):
             if (index, kind) in self._places:
                 self._draw(self._read(index, kind), masks, value)
@@ -161,8 +164,17 @@ class MaskStore:
         return result
 
     def sequence(self, indices: NDArray[np.int64]) -> Frames[Masks]:
-        """Return the masks of these frames, unpacked on access."""
-        return Frames(self.get, indices.tolist())
+        """Return the masks of these frames, unpacked on access, those of :data:`TOGETHER` frames in one array."""
+        blocks = weakref.WeakValueDictionary[int, Masks]()
+        numbers = indices.tolist()
+
+        def get(i: int) -> Masks:
+            block = blocks.get(i // TOGETHER)
+            if block is None:
+                blocks[i // TOGETHER] = block = np.empty((TOGETHER, *self._shapes[_PERSON]), np.uint8)
+            return self.get(numbers[i], block[i % TOGETHER])
+
+        return Frames(get, range(len(numbers)))
 
     def color_sequence(self, indices: NDArray[np.int64]) -> Frames[Colors | None]:
         """Return what the masks of these frames show, as :meth:`colors`, unpacked on access."""
@@ -220,7 +232,7 @@ class MaskStores:
 class Frames(Sequence[T]):
     """A sequence of what is stored of frames, which holds one at a time."""
 
-    def __init__(self, get: Callable[[int], T], indices: list[int]) -> None:
+    def __init__(self, get: Callable[[int], T], indices: Sequence[int]) -> None:
         self._get, self._indices = get, indices
 
     def __len__(self) -> int:
