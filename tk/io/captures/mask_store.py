@@ -121,13 +121,10 @@ class MaskStore:
             raise self._no_room(error) from None
         self._places[index, kind] = (place, len(packed))
 
-    def get(self, index: int, out: Masks | None = None) -> Masks:
-        """Return the masks (C, H, W) of a stored frame, in ``out`` if it is given."""
-        masks = np.empty(self._shapes[_PERSON], np.uint8) if out is None else out
-        masks.fill(0)
-        for kind, value in ((_PERSON, 255), (_OTHERS, OTHERS)):
-            if (index, kind) in self._places:
-                self._draw(self._read(index, kind), masks, value)
+    def get(self, index: int) -> Masks:
+        """Return the masks (C, H, W) of a stored frame."""
+        masks = np.zeros(self._shapes[_PERSON], np.uint8)
+        self._draw(index, masks)
         return masks
 
     def colors(self, index: int) -> Colors | None:
@@ -142,14 +139,18 @@ class MaskStore:
         self._opened.seek(place)
         return zlib.decompress(self._opened.read(size))
 
-    def _draw(self, stored: bytes, masks: Masks, value: int) -> None:
-        """Set the stored pixels of masks (C, H, W) to a value."""
-        boxes = np.frombuffer(stored, _BOX, 4 * len(masks)).reshape(-1, 4)
-        bits = np.unpackbits(np.frombuffer(stored, np.uint8, offset=boxes.nbytes))
-        begin = 0
-        for mask, (x, y, w, h) in zip(masks, boxes.tolist(), strict=True):
-            mask[y : y + h, x : x + w] |= bits[begin : begin + w * h].reshape(h, w) * np.uint8(value)
-            begin += w * h
+    def _draw(self, index: int, masks: Masks) -> None:
+        """Set the stored pixels of a frame in masks (C, H, W) that show nobody."""
+        for kind, value in ((_PERSON, 255), (_OTHERS, OTHERS)):
+            if (index, kind) not in self._places:
+                continue
+            stored = self._read(index, kind)
+            boxes = np.frombuffer(stored, _BOX, 4 * len(masks)).reshape(-1, 4)
+            bits = np.unpackbits(np.frombuffer(stored, np.uint8, offset=boxes.nbytes))
+            begin = 0
+            for mask, (x, y, w, h) in zip(masks, boxes.tolist(), strict=True):
+                mask[y : y + h, x : x + w] |= bits[begin : begin + w * h].reshape(h, w) * np.uint8(value)
+                begin += w * h
 
     def without(self, cameras: NDArray[np.bool_]) -> MaskStore:
         """Return a store in which some cameras (C,) show nobody: a copy, or this one if there is no such camera."""
@@ -164,15 +165,22 @@ class MaskStore:
         return result
 
     def sequence(self, indices: NDArray[np.int64]) -> Frames[Masks]:
-        """Return the masks of these frames, unpacked on access, those of :data:`TOGETHER` frames in one array."""
-        blocks = weakref.WeakValueDictionary[int, Masks]()
-        numbers = indices.tolist()
+        """Return the masks of these frames, not to be changed, unpacked on access; those of :data:`TOGETHER` frames lie
+        in one array."""
+        numbers, blocks = indices.tolist(), weakref.WeakValueDictionary[int, Masks]()
+        unpacked: dict[int, set[int]] = {}  # frames of each block
 
         def get(i: int) -> Masks:
             block = blocks.get(i // TOGETHER)
             if block is None:
-                blocks[i // TOGETHER] = block = np.empty((TOGETHER, *self._shapes[_PERSON]), np.uint8)
-            return self.get(numbers[i], block[i % TOGETHER])
+                blocks[i // TOGETHER] = block = np.zeros((TOGETHER, *self._shapes[_PERSON]), np.uint8)
+                unpacked[i // TOGETHER] = set()
+            masks = block[i % TOGETHER]
+            if i not in unpacked[i // TOGETHER]:
+                self._draw(numbers[i], masks)
+                unpacked[i // TOGETHER].add(i)
+            masks.flags.writeable = False
+            return masks
 
         return Frames(get, range(len(numbers)))
 
