@@ -424,8 +424,7 @@ def _serve(tracker: Channel) -> None:
         shifted = source.shifted(delays)
         late = [c for c, frames in enumerate(shifted.late_frames) if frames != source.late_frames[c]]
         if late:
-            film.withdraw()  # until it is complete again
-            with shifted.images_of(late, film.frames) as frames:
+            with shifted.images_of(late, film.withdraw()) as frames:  # it is incomplete until the end
                 for frame in frames:
                     images = dict(zip(late, frame.images, strict=True))
                     _keep(film, frame.index, images, order.task.setup.rig, tracker.send)

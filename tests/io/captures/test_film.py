@@ -66,8 +66,7 @@ def test_images_of_one_camera_are_exchanged(film: Film, plain: bool) -> None:
     for index in (3, 5, 7):
         film.put(index, IMAGES[index], nobody)
     before = dict(film.images([3, 5, 7]))
-    film.withdraw()
-    assert not film.places()
+    assert film.withdraw() == [3, 5, 7] and not film.places()
     for index in (3, 5):  # the process is killed
         film.put(index, [None, IMAGES[index + 1][1]], nobody)
     assert film.places().keys() == {3, 5}

@@ -69,8 +69,11 @@ class Film:
             return None
 
     def put(self, index: int, images: Sequence[Image | None], note: Callable[[str], None]) -> None:
-        """Keep the images (C,) of a frame if it is one of :attr:`frames`; None: the image that is kept already. If the
-        disk is full, ``note`` receives a line, and the film ends."""
+        """Keep the images (C,) of a frame if it is one of :attr:`frames`.
+
+        None instead of an image, in a frame that was withdrawn: the image that was kept. If the disk is full, ``note``
+        receives a line, and the film ends.
+        """
         if index not in self.frames:
             return
         kept = self._kept.get(index)
@@ -100,11 +103,13 @@ class Film:
         self._end = max(self._end, place + size)
         self._kept[index] = place + head.nbytes + np.cumsum([0, *lengths])
 
-    def withdraw(self) -> None:
-        """Remove all frames; each is there again when it is put once more, with images that are kept or new."""
+    def withdraw(self) -> list[int]:
+        """Remove all frames, and return their numbers, ascending; each is there again when it is put once more, with
+        images that are kept or new."""
         for bounds in self._kept.values():
             head = _head(_WITHDRAWN, np.diff(bounds).tolist())
             self.file.write([head.data], int(bounds[0]) - head.nbytes)
+        return sorted(self._kept)
 
     def places(self) -> dict[int, NDArray[np.int64]]:
         """Return the frames in the file, and where the images of each begin and end, (C + 1,) bytes; of two records of
