@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.runtime import ensure_runtime, ti
+from tk.kernels.taichi_internals import Launcher
 
 
 @ti.func
@@ -90,6 +91,9 @@ def _learn_kernel(
         support[pixel] = ti.cast(ti.min(most, 255), ti.u8)
 
 
+_learn = Launcher(_learn_kernel)
+
+
 def learn_scene(
     images: NDArray[np.uint8],
     weights: NDArray[np.uint8],
@@ -114,7 +118,7 @@ def learn_scene(
     ensure_runtime()
     plate = np.zeros(images.shape[1:], np.uint8)
     support = np.zeros(images.shape[1:3], np.uint8)
-    _learn_kernel(
+    _learn(
         images.reshape(-1), weights.reshape(-1), support.size, tolerance, least, darkest, spread,
         plate.reshape(-1), support.reshape(-1),
     )  # fmt: skip

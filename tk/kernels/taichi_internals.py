@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import gc
 import inspect
 import sys
 import textwrap
@@ -103,7 +104,8 @@ class Launcher:
         with self._lock:
             running = program()
             if self._compiled is None or self._program is not running:
-                self._kernel(*self._constants, *values)
+                with _no_collection():
+                    self._kernel(*self._constants, *values)
                 self._remember(values)
                 return
             for argument, value in zip(self._arguments, values, strict=True):
@@ -137,6 +139,18 @@ class Launcher:
             for i, value in enumerate(values, len(self._constants))
         ]
         self._program, self._context, self._compiled = running, context, compiled
+
+
+@contextlib.contextmanager
+def _no_collection() -> Iterator[None]:
+    """Collect no garbage inside: the syntax tree of a kernel consists of many objects, all of them in use."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 # --- decorators ---------------------------------------------------------------------------------------------------

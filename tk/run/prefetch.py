@@ -6,7 +6,7 @@ again). Messages pass through a channel, frames through memory that both process
 
     tracker ── task, span of frames, numbers of free slots ──► process ──► small images (tk.io.captures.film)
             ◄── _Ready: number of a slot with a frame, notes, _Failed, None after the last frame ──
-            ── delays of the cameras that the run has found, seconds, or None ──► small images once more, if any
+            ── delays of the cameras that the run has found, seconds, or None ──► their small images once more, if any
 
 The system frees the memory when both processes have ended, however they end. When the tracker ends, the channel closes,
 and the process ends, too. The frames equal those of :class:`Serial` bit for bit.
@@ -36,8 +36,8 @@ from numpy.typing import NDArray
 
 from tk.errors import TkError, WorkerError
 from tk.io.captures.capture import Capture
+from tk.io.captures.clip import Image
 from tk.io.captures.film import Film
-from tk.io.captures.frames import FrameSet
 from tk.kernels.runtime import ensure_runtime
 from tk.model.cameras.camera import Rig
 from tk.run import worker
@@ -137,7 +137,7 @@ def observe(
             if frame is None:
                 return
             if film is not None:
-                _keep(film, frame, task.setup.rig, note)
+                _keep(film, frame.index, dict(enumerate(frame.images)), task.setup.rig, note)
             watch.lap("decode")
             labels = label(frame)
             images = frame.halved if image_step == 2 else frame.images
@@ -148,9 +148,9 @@ def observe(
             yield labelled, watch
 
 
-def _keep(film: Film, frame: FrameSet, rig: Rig, note: Note) -> None:
-    """Keep the images of a frame, without their padding."""
-    film.put(frame.index, [image[: c.height, : c.width] for image, c in zip(frame.images, rig, strict=True)], note)
+def _keep(film: Film, index: int, images: Mapping[int, Image], rig: Rig, note: Note) -> None:
+    """Keep the images of a frame by some cameras, by their index, without the padding."""
+    film.put(index, [images[c][: one.height, : one.width] if c in images else None for c, one in enumerate(rig)], note)
 
 
 @dataclass(frozen=True)
@@ -421,7 +421,10 @@ def _serve(tracker: Channel) -> None:
     while isinstance(delays := tracker.receive(), int):  # slots that are free again
         pass
     if delays is not None:
-        film.clear()
-        with source.shifted(delays).some_frames(film.frames) as frames:
-            for frame in frames:
-                _keep(film, frame, order.task.setup.rig, tracker.send)
+        shifted = source.shifted(delays)
+        late = [c for c, frames in enumerate(shifted.late_frames) if frames != source.late_frames[c]]
+        if late:
+            with shifted.images_of(late, film.withdraw()) as frames:  # it is incomplete until the end
+                for frame in frames:
+                    images = dict(zip(late, frame.images, strict=True))
+                    _keep(film, frame.index, images, order.task.setup.rig, tracker.send)

@@ -59,6 +59,23 @@ def test_images_of_the_chosen_frames_are_kept_small(film: Film, tmp_path: Path, 
         assert np.array_equal(second, IMAGES[index][1]) == plain
 
 
+@pytest.mark.parametrize("plain", [True, False])
+def test_images_of_one_camera_are_exchanged(film: Film, plain: bool) -> None:
+    if not plain:
+        film.frames = range(3, 50_000, 2)
+    for index in (3, 5, 7):
+        film.put(index, IMAGES[index], nobody)
+    before = dict(film.images([3, 5, 7]))
+    assert film.withdraw() == [3, 5, 7] and not film.places()
+    for index in (3, 5):  # the process is killed
+        film.put(index, [None, IMAGES[index + 1][1]], nobody)
+    assert film.places().keys() == {3, 5}
+    for index, (first, second) in film.images([3, 5]):
+        np.testing.assert_array_equal(first, before[index][0])
+        assert np.abs(second.astype(int) - IMAGES[index + 1][1]).mean() < 3
+        assert not np.array_equal(second, before[index][1])
+
+
 def test_another_process_continues_the_film(film: Film) -> None:
     theirs = replace(film, file=NamelessFile(os.dup(film.file.handle)))
     for index, images in IMAGES.items():

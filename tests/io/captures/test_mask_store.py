@@ -11,6 +11,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from tk.errors import TkError
 from tk.io.captures.mask_store import MaskStore
 from tk.kernels.mask_values import OTHERS
+from tk.model.masks.silhouettes import Pyramid
 
 
 @given(masks=array_shapes(min_dims=3, max_dims=3, max_side=13).flatmap(lambda s: arrays(np.uint8, s)))
@@ -57,6 +58,26 @@ def test_a_sequence_of_frames_has_the_requested_order(seed):
     np.testing.assert_array_equal(frames[-1], masks[int(wanted[-1])])
     with pytest.raises(IndexError):
         frames[6]
+
+
+def test_masks_of_neighbouring_frames_are_joined_without_a_copy():
+    rng, store, frames = np.random.default_rng(0), MaskStore(), 20
+    masks = (rng.random((frames, 2, 5, 9)) < 0.5).astype(np.uint8) * 255
+    for index in range(frames):
+        store.put(index, masks[index])
+    found = store.sequence(np.arange(frames))
+    sizes = (np.array([[9, 5], [9, 5]], np.int32),)
+
+    def joined(chosen):
+        return Pyramid.of_all([Pyramid((found[i],), sizes) for i in chosen], 0).masks[0]
+
+    first = found[0]
+    for chosen in (range(16), range(3, 7), range(16, 20), range(12, 20), (1, 0), (4, 6), (2, 2)):
+        whole = joined(chosen)
+        np.testing.assert_array_equal(whole, masks[list(chosen)].reshape(-1, 5, 9))
+    assert np.shares_memory(joined(range(16)), first) and not np.shares_memory(joined((0, 2)), first)
+    with pytest.raises(ValueError, match="read-only"):
+        first[0, 0, 0] = 1
 
 
 def test_a_frame_of_silhouettes_takes_less_than_ten_kilobytes(tmp_path):

@@ -240,6 +240,11 @@ class Capture:
         """Return the frames with these indices, ascending, decoded ahead."""
         return FrameReader(self.clips, self.mask_clips, self.rig.frame_shape, wanted, self.late_frames, self.fps)
 
+    def images_of(self, cameras: Sequence[int], wanted: Sequence[int]) -> FrameReader:
+        """Return the frames with these indices, ascending, with the images of some cameras, and no masks."""
+        late = [self.late_frames[c] for c in cameras]
+        return FrameReader([self.clips[c] for c in cameras], None, self.rig.frame_shape, wanted, late, self.fps)
+
     def background(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return the empty scene: an array (T, h, w, 3) uint8 BGR for each camera; None without `[background]` and
         without a `background/` folder.

@@ -29,6 +29,7 @@ _MOST_PER_S, _MOST = 15.0, 3000
 # third of what their frame of the video takes in all.
 _PLAIN = 500_000_000
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 90)  # appearance only
+_WITHDRAWN = -1  # instead of a frame's number
 #: bytes on the disk that are left to the result and its masks
 LEFT_FREE = 1_000_000_000
 
@@ -57,6 +58,7 @@ class Film:
     late_frames: tuple[int, ...] = ()
     frames: range = range(0)
     _end: int = field(default=0, init=False)  # bytes written
+    _kept: dict[int, NDArray[np.int64]] = field(default_factory=dict, init=False)  # :meth:`places` of those written
 
     @staticmethod
     def in_folder(folder: Path, sizes: Sequence[tuple[int, int]], late_frames: tuple[int, ...] = ()) -> Film | None:
@@ -66,35 +68,52 @@ class Film:
         except OSError:
             return None
 
-    def put(self, index: int, images: Sequence[Image], note: Callable[[str], None]) -> None:
-        """Keep the images (C,) of a frame if it is one of :attr:`frames`. If the disk is full, ``note`` receives a
-        line, and the film ends."""
+    def put(self, index: int, images: Sequence[Image | None], note: Callable[[str], None]) -> None:
+        """Keep the images (C,) of a frame if it is one of :attr:`frames`.
+
+        None instead of an image, in a frame that was withdrawn: the image that was kept. If the disk is full, ``note``
+        receives a line, and the film ends.
+        """
         if index not in self.frames:
             return
-        small = [_resized(image, size) for image, size in zip(images, self.sizes, strict=True)]
-        coded = [image if self._plain else cv2.imencode(".jpg", image, _JPEG)[1] for image in small]
-        record = [_head(index, [each.nbytes for each in coded]), *coded]
-        size = sum(part.nbytes for part in record)
+        kept = self._kept.get(index)
+        coded = [] if kept is None else self._coded(kept)
+        for c, image in enumerate(images):
+            if image is not None:
+                small = _resized(image, self.sizes[c])
+                coded[c : c + 1] = [small if self._plain else np.asarray(cv2.imencode(".jpg", small, _JPEG)[1])]
+        lengths = [each.nbytes for each in coded]
+        head = _head(index, lengths)
+        place = self._end
+        if kept is not None and np.array_equal(np.diff(kept), lengths):
+            place = int(kept[0]) - head.nbytes
+        size = head.nbytes + sum(lengths)
         try:
             if shutil.disk_usage(self.where).free < LEFT_FREE + size:
                 raise OSError(f"less than {LEFT_FREE / 1e9:g} GB is free")
-            if self.file.write([part.data for part in record], self._end) < size:
+            if self.file.write([head.data, *(part.data for part in coded)], place) < size:
                 raise OSError("it is full")
         except OSError as error:
             self.frames = range(0)
+            self._kept.clear()
             self.file.truncate(0)
             reason = error.strerror or error
             note(f"{self.where}: no small images can be kept there ({reason}): the videos are decoded twice")
             return
-        self._end += size
+        self._end = max(self._end, place + size)
+        self._kept[index] = place + head.nbytes + np.cumsum([0, *lengths])
 
-    def clear(self) -> None:
-        """Remove all images."""
-        self.file.truncate(0)
-        self._end = 0
+    def withdraw(self) -> list[int]:
+        """Remove all frames, and return their numbers, ascending; each is there again when it is put once more, with
+        images that are kept or new."""
+        for bounds in self._kept.values():
+            head = _head(_WITHDRAWN, np.diff(bounds).tolist())
+            self.file.write([head.data], int(bounds[0]) - head.nbytes)
+        return sorted(self._kept)
 
     def places(self) -> dict[int, NDArray[np.int64]]:
-        """Return the frames in the file, and where the images of each begin and end, (C + 1,) bytes."""
+        """Return the frames in the file, and where the images of each begin and end, (C + 1,) bytes; of two records of
+        a frame, the second."""
         found, end, whole = dict[int, NDArray[np.int64]](), 0, self.file.size()
         size = _head(0, [0] * len(self.sizes)).nbytes
         while end + size <= whole:
@@ -103,6 +122,7 @@ class Film:
             end = int(bounds[-1])
             if end <= whole:  # else the process was killed while it wrote
                 found[int(index)] = bounds
+        found.pop(_WITHDRAWN, None)
         return found
 
     def images(self, frames: Iterable[int]) -> Iterator[tuple[int, list[Image]]]:
@@ -118,9 +138,13 @@ class Film:
             for frame, result in coming:
                 yield frame, result()
 
-    def _read(self, bounds: NDArray[np.int64]) -> list[Image]:
+    def _coded(self, bounds: NDArray[np.int64]) -> list[NDArray[np.uint8]]:
+        """Return the images (C,) between these bounds as they are in the file."""
         record = np.frombuffer(self.file.read(int(bounds[-1] - bounds[0]), int(bounds[0])), np.uint8)
-        coded = np.split(record, bounds[1:-1] - bounds[0])
+        return np.split(record, bounds[1:-1] - bounds[0])
+
+    def _read(self, bounds: NDArray[np.int64]) -> list[Image]:
+        coded = self._coded(bounds)
         if self._plain:
             return [image.reshape(height, width, 3) for image, (width, height) in zip(coded, self.sizes, strict=True)]
         return [np.asarray(cv2.imdecode(each, cv2.IMREAD_COLOR), np.uint8) for each in coded]

@@ -31,6 +31,8 @@ T = TypeVar("T")
 
 #: most bytes in memory; larger stores are on disk
 IN_MEMORY = 32_000_000
+#: frames of a sequence whose masks lie one after the other, as the second pass takes them
+TOGETHER = 16
 
 
 #: header of each record: the frame's number, the kind of the record, the number of bytes that follow, and the shape of
@@ -122,9 +124,7 @@ class MaskStore:
     def get(self, index: int) -> Masks:
         """Return the masks (C, H, W) of a stored frame."""
         masks = np.zeros(self._shapes[_PERSON], np.uint8)
-        for kind, value in ((_PERSON, 255), (_OTHERS, OTHERS)):
-            if (index, kind) in self._places:
-                self._draw(self._read(index, kind), masks, value)
+        self._draw(index, masks)
         return masks
 
     def colors(self, index: int) -> Colors | None:
@@ -139,14 +139,18 @@ class MaskStore:
         self._opened.seek(place)
         return zlib.decompress(self._opened.read(size))
 
-    def _draw(self, stored: bytes, masks: Masks, value: int) -> None:
-        """Set the stored pixels of masks (C, H, W) to a value."""
-        boxes = np.frombuffer(stored, _BOX, 4 * len(masks)).reshape(-1, 4)
-        bits = np.unpackbits(np.frombuffer(stored, np.uint8, offset=boxes.nbytes))
-        begin = 0
-        for mask, (x, y, w, h) in zip(masks, boxes.tolist(), strict=True):
-            mask[y : y + h, x : x + w] |= bits[begin : begin + w * h].reshape(h, w) * np.uint8(value)
-            begin += w * h
+    def _draw(self, index: int, masks: Masks) -> None:
+        """Set the stored pixels of a frame in masks (C, H, W) that show nobody."""
+        for kind, value in ((_PERSON, 255), (_OTHERS, OTHERS)):
+            if (index, kind) not in self._places:
+                continue
+            stored = self._read(index, kind)
+            boxes = np.frombuffer(stored, _BOX, 4 * len(masks)).reshape(-1, 4)
+            bits = np.unpackbits(np.frombuffer(stored, np.uint8, offset=boxes.nbytes))
+            begin = 0
+            for mask, (x, y, w, h) in zip(masks, boxes.tolist(), strict=True):
+                mask[y : y + h, x : x + w] |= bits[begin : begin + w * h].reshape(h, w) * np.uint8(value)
+                begin += w * h
 
     def without(self, cameras: NDArray[np.bool_]) -> MaskStore:
         """Return a store in which some cameras (C,) show nobody: a copy, or this one if there is no such camera."""
@@ -161,8 +165,24 @@ class MaskStore:
         return result
 
     def sequence(self, indices: NDArray[np.int64]) -> Frames[Masks]:
-        """Return the masks of these frames, unpacked on access."""
-        return Frames(self.get, indices.tolist())
+        """Return the masks of these frames, not to be changed, unpacked on access; those of :data:`TOGETHER` frames lie
+        in one array."""
+        numbers, blocks = indices.tolist(), weakref.WeakValueDictionary[int, Masks]()
+        unpacked: dict[int, set[int]] = {}  # frames of each block
+
+        def get(i: int) -> Masks:
+            block = blocks.get(i // TOGETHER)
+            if block is None:
+                blocks[i // TOGETHER] = block = np.zeros((TOGETHER, *self._shapes[_PERSON]), np.uint8)
+                unpacked[i // TOGETHER] = set()
+            masks = block[i % TOGETHER]
+            if i not in unpacked[i // TOGETHER]:
+                self._draw(numbers[i], masks)
+                unpacked[i // TOGETHER].add(i)
+            masks.flags.writeable = False
+            return masks
+
+        return Frames(get, range(len(numbers)))
 
     def color_sequence(self, indices: NDArray[np.int64]) -> Frames[Colors | None]:
         """Return what the masks of these frames show, as :meth:`colors`, unpacked on access."""
@@ -220,7 +240,7 @@ class MaskStores:
 class Frames(Sequence[T]):
     """A sequence of what is stored of frames, which holds one at a time."""
 
-    def __init__(self, get: Callable[[int], T], indices: list[int]) -> None:
+    def __init__(self, get: Callable[[int], T], indices: Sequence[int]) -> None:
         self._get, self._indices = get, indices
 
     def __len__(self) -> int:

@@ -242,18 +242,25 @@ class _Pairs(NamedTuple):
             fit[np.arange(len(pairs)), own] = sets.of_cameras(own).showing(alone)
         return _Pairs(sets, pairs, both.at, fit)
 
-    def consensus(self, but: int = -1) -> Consensus:
-        """Return what most cameras show, those of camera ``but`` left out."""
-        C, L = self.sets.known.shape
-        fit = np.where((np.arange(C) == but) | np.isnan(self.fit), 0.0, self.fit)
+    def agreeing(self, but: int = -1) -> tuple[NDArray[np.bool_], float]:
+        """Return :attr:`Consensus.agree` and :attr:`Consensus.support`, those of camera ``but`` left out."""
+        fit = np.where((np.arange(len(self.sets.known)) == but) | np.isnan(self.fit), 0.0, self.fit)
         support = np.maximum(fit, 0.0).sum(axis=1)
         support[(np.take_along_axis(fit, self.pairs, axis=1) <= 0).any(axis=1)] = 0.0
         if not (support > 0).any():
-            return Consensus(np.zeros(C, np.bool_), np.full((L, 3), np.nan), 0.0)
+            return np.zeros(len(self.sets.known), np.bool_), 0.0
         best = int(np.argmax(support))
-        agree = fit[best] > 0
-        points = _Points.of(self.sets.of_cameras(np.flatnonzero(agree)))
-        return Consensus(agree, points.at, float(support[best]))
+        return fit[best] > 0, float(support[best])
+
+    def points_of(self, agree: NDArray[np.bool_]) -> _Points:
+        """Return the person's points by some cameras (C,)."""
+        return _Points.of(self.sets.of_cameras(np.flatnonzero(agree)))
+
+    def consensus(self) -> Consensus:
+        """Return what most cameras show."""
+        agree, support = self.agreeing()
+        unknown = np.full((self.sets.known.shape[1], 3), np.nan)
+        return Consensus(agree, self.points_of(agree).at if agree.any() else unknown, support)
 
     def evidence(self) -> Float:
         """Return (C,) the logarithm of each camera's likelihood ratio by the others; NaN without another one."""
@@ -267,7 +274,5 @@ class _Pairs(NamedTuple):
     def fit_without(self, but: int, shown: _Sets) -> Float:
         """Return (N,) the logarithm of the likelihood ratio of each of N sets in camera ``but`` showing the person whom
         the others see; NaN if no two others agree, or a set is empty."""
-        agree = self.consensus(but).agree
-        if not agree.any():
-            return np.full(len(shown.known), np.nan)
-        return shown.showing(_Points.of(self.sets.of_cameras(np.flatnonzero(agree))))
+        agree, _ = self.agreeing(but)
+        return shown.showing(self.points_of(agree)) if agree.any() else np.full(len(shown.known), np.nan)

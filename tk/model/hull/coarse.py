@@ -173,7 +173,7 @@ class CoarseHull:
         for c in np.flatnonzero(cameras):
             sees = self._voxels.sees[c]
             seeing += sees
-            agreeing += sees & (masks[c].ravel()[self._voxels.pixels[c]] > 0)
+            agreeing += sees & (masks[c].ravel().take(self._voxels.pixels[c]) > 0)
         return seeing, agreeing
 
     def _largest(self, seeing: NDArray[np.uint8], agreeing: NDArray[np.uint8], wrong: int) -> Bool:

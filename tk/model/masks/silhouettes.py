@@ -44,9 +44,19 @@ class Pyramid:
     def of_all(frames: Sequence[Pyramid], scale: int) -> Pyramid:
         """Join one scale of several frames; the others are empty."""
         none = np.zeros((0, 0, 0), np.uint8)
-        masks = np.concatenate([frame.masks[scale] for frame in frames])
+        masks = _one_after_the_other([frame.masks[scale] for frame in frames])
         measured = joined([frame.measured for frame in frames])
         return Pyramid((none,) * scale + (masks,), frames[0].sizes[: scale + 1], measured)
+
+
+def _one_after_the_other(masks: Sequence[Masks]) -> Masks:
+    """Return masks (V, H, W) of F frames as (F V, H, W): without a copy if they already lie so in an array."""
+    whole, first, places = masks[0].base, masks[0], [each.ctypes.data for each in masks]
+    follow = places == list(range(places[0], places[0] + len(masks) * first.nbytes, first.nbytes))
+    if whole is None or not follow or any(each.base is not whole for each in masks):
+        return np.concatenate(masks)
+    begin = (places[0] - whole.ctypes.data) // first[0].nbytes
+    return np.asarray(whole.reshape(-1, *first.shape[1:])[begin : begin + len(masks) * len(first)])
 
 
 class Views:
