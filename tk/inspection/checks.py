@@ -25,6 +25,7 @@ from tk.io.captures.video import odd_turn
 from tk.kernels.mask_values import PERSON
 from tk.model.body.plausibility import fits_height
 from tk.model.cameras.common_view import sample_box, views_of
+from tk.model.cameras.landmark_agreement import consensus, trunk
 from tk.model.cameras.up import shown, up_vector
 from tk.model.cameras.volume import Volume
 from tk.model.hull.coarse import Hull
@@ -33,7 +34,7 @@ from tk.model.masks.image_shift import shift_between
 from tk.model.masks.mask_agreement import INCONSISTENT, Agreement, MaskAgreement
 from tk.model.masks.regions import clean_by_area
 from tk.model.masks.silhouettes import HOLE_SHARE, SPECK_SHARE
-from tk.run.segmentation import make_labeller
+from tk.run.segmentation import make_labeller, people_in_scene
 from tk.run.task import Task
 from tk.settings import Settings
 from tk.threads import one_thread
@@ -128,7 +129,8 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
     ]
     moved = [line for i in kept[:1] for line in _moved_since_empty(capture, read.images[int(i)], masks[int(i)])]
     denied = bool(by_masks.refusal or by_masks.wrong) and not (agreement.refusal or agreement.wrong)
-    findings = [*moved, *_findings(inspection, capture, agreement, denied)]
+    scene = [] if capture.has_masks else _somebody_in_empty(Task.of(capture, config), capture.background())
+    findings = [*scene, *moved, *_findings(inspection, capture, agreement, denied)]
     if not agreement.wrong:  # a wrong camera makes one person look like several
         findings += many_people(people, entered)
     return replace(inspection, findings=tuple([unrelated, *findings] if unrelated else findings)), seen
@@ -254,6 +256,23 @@ def _moved_since_empty(capture: Capture, images: NDArray[np.uint8], masks: Masks
                 "recording: record the empty scene again, and calibrate again if that was done before the move"
             )
     return lines
+
+
+def _somebody_in_empty(task: Task, empty: Sequence[NDArray[np.uint8]] | None) -> list[str]:
+    """Return a line if a network finds a person in two or more images of the empty scene, inside the working volume:
+    what the person hides there is no background."""
+    if empty is None:
+        return []
+    images = np.zeros((len(empty), *task.setup.rig.frame_shape, 3), np.uint8)
+    for image, clip in zip(images, empty, strict=True):
+        image[: clip.shape[1], : clip.shape[2]] = clip[0]
+    for seen in () if (people := people_in_scene(task, images)) is None else people:
+        shown = consensus(task.setup.rig, seen)
+        place, volume = trunk(shown.points), task.setup.volume
+        if ((place > volume.lower) & (place < volume.upper)).all():
+            names = ", ".join(np.array(task.setup.rig.names)[shown.agree])
+            return [f"the empty scene shows a person ({names}): record it again when nobody is there"]
+    return []
 
 
 def _findings(found: Inspection, capture: Capture, agreement: Agreement, denied: bool) -> list[str]:

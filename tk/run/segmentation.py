@@ -132,12 +132,7 @@ def landmark_asker(task: Task) -> LandmarkAsker | None:
     if (name := _asked_for_landmarks(task)) is None:
         return None
     size = task.setup.rig.frame_shape[::-1]
-
-    @cache
-    def network() -> PeopleMasks:
-        from tk.segmenters.people_masks import PeopleMasks  # SciPy, which takes a second to import
-
-        return PeopleMasks(task.source.segmenter or load(name), name, task.setup.rig, task.setup.volume)
+    network = cache(lambda: _network(task, name))
 
     def ask(images: NDArray[np.uint8], points: NDArray[np.float64]) -> NDArray[np.float64] | None:
         whole = np.stack([cv2.resize(image, size, interpolation=cv2.INTER_LINEAR) for image in images])
@@ -146,19 +141,35 @@ def landmark_asker(task: Task) -> LandmarkAsker | None:
     return ask
 
 
+def people_in_scene(task: Task, images: NDArray[np.uint8]) -> NDArray[np.float64] | None:
+    """Return the landmarks (N, C, L, 4) of the people in images (C, H, W, 3) of the empty scene; None if there is no
+    network that trackers ask for landmarks."""
+    name = _asked_for_landmarks(task)
+    return None if name is None else _network(task, name).label(images).landmarks
+
+
+def _network(task: Task, name: str) -> PeopleMasks:
+    """Return the people in all images by a segmenter of this name.
+
+    Raises:
+        ConfigError: it cannot be loaded.
+    """
+    from tk.segmenters.people_masks import PeopleMasks  # SciPy, which takes a second to import
+
+    return PeopleMasks(task.source.segmenter or load(name), name, task.setup.rig, task.setup.volume)
+
+
 def _with_landmarks(task: Task, labeller: Labeller) -> Labeller:
     """Return a labeller that asks the segmenter for the landmarks of every frame.
 
     Raises:
         ConfigError: no segmenter is installed, or it cannot be loaded.
     """
-    from tk.segmenters.people_masks import PeopleMasks  # SciPy, which takes a second to import
-
     installed = names()
     if task.source.segmenter is None and not installed:
         raise ConfigError(f"landmarks = always: {NO_SEGMENTER}")
     name = installed[0] if task.source.segmenter is None else type(task.source.segmenter).__name__
-    people = PeopleMasks(task.source.segmenter or load(name), name, task.setup.rig, task.setup.volume)
+    people = _network(task, name)
 
     def label(frame: FrameSet) -> Labels:
         labels = labeller(frame)
@@ -179,7 +190,7 @@ def prepare_kernels() -> None:
 
 
 def _labeller(task: Task, note: Callable[[str], None]) -> Labeller:
-    setup, source = task.setup, task.source
+    source = task.source
     origin = mask_source(source)
     if origin == _GIVEN:
         return _given_masks
@@ -187,10 +198,7 @@ def _labeller(task: Task, note: Callable[[str], None]) -> Labeller:
         name = origin.removeprefix(_SEGMENTER)
         if source.segmenter is None:
             note(f"{source.where}: no masks and no background/; the segmenter {name} makes the masks")
-        from tk.segmenters.people_masks import PeopleMasks  # SciPy, which takes a second to import
-
-        made = PeopleMasks(source.segmenter or load(name), name, setup.rig, setup.volume)
-        learned = LearnedMasks(task, made)
+        learned = LearnedMasks(task, _network(task, name))
         if reason := learned.why_throughout():
             note(f"{source.where}: the segmenter makes the masks of every frame, which takes long: {reason}")
         return lambda frame: Labels(*learned.label(frame))
