@@ -216,9 +216,6 @@ CAMERAS = (
 
 SCHEMA = (*ROWS, BRIDGED, *HULL, *CAMERAS)
 
-#: datasets and groups of one person; the other parts of a file belong to all
-PERSON = (*dict.fromkeys(e.path.split("/")[0] for e in (*ROWS, BRIDGED, *HULL) if not e.of_run), "model")
-
 
 @dataclass(frozen=True)
 class Column:
