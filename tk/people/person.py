@@ -18,7 +18,8 @@ from tk.model.setup import Subject
 from tk.model.stateful import Stateful
 from tk.people.share import REACH_M, STRANGER_SHARE
 from tk.trackers.camera_monitor import CameraMonitor, MonitorState
-from tk.trackers.protocol import Estimate, Frame, SharingTracker, Tracker, sharing, without_cameras
+from tk.trackers.contour_tracker import ContourTracker
+from tk.trackers.protocol import Estimate, Frame, Tracker, sharing, without_cameras
 from tk.trackers.reason import Reason
 from tk.trackers.registry import TrackerState
 
@@ -94,7 +95,7 @@ class Person(Stateful[PersonMotion]):
     place: Float | None = None  # (3,) m, mean of the joints in that frame
 
     @property
-    def sharing(self) -> SharingTracker:
+    def sharing(self) -> ContourTracker[Any]:
         """The tracker, which can track a person among others."""
         tracker = sharing(self.tracker)
         assert tracker is not None

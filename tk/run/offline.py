@@ -31,8 +31,9 @@ from tk.run.second_run import Run, explains_better, track_again, track_back
 from tk.run.task import Task
 from tk.trackers.hypotheses import DROPPED
 from tk.trackers.judgement import FrameEvidence, FrameJudge, depth_known, judge_frames
-from tk.trackers.protocol import Estimate, TwoPassTracker, two_pass, usable
+from tk.trackers.protocol import Estimate, two_pass, usable
 from tk.trackers.reason import Reason, known_sigma, report_frames, status_of
+from tk.trackers.region import RegionTracker
 
 _LOG = logging.getLogger(__name__)
 Float = NDArray[np.float64]
@@ -199,7 +200,7 @@ class _Finisher:
             draft.columns |= {"pose": poses, "residual": residual, "evidence/sigma": sigma}
             draft.refined = True
 
-    def _with_true_heading(self, draft: Draft) -> TwoPassTracker:
+    def _with_true_heading(self, draft: Draft) -> RegionTracker:
         """If the opposite heading is not improbable, by all frames, track the person again with it and its body; keep
         the more probable one in the draft. Return the tracker of the heading that is kept.
 
@@ -219,7 +220,7 @@ class _Finisher:
             shown = [np.where(unused[row][:, None, None], 0, masks.get(int(draft.result.frames[row]))) for row in rows]
             return shown, in_frames(measured, rows, ~unused[rows])
 
-        def cost(tracker: TwoPassTracker, poses: Float, one: Draft) -> float:
+        def cost(tracker: RegionTracker, poses: Float, one: Draft) -> float:
             """Return the cost of poses (F, D) after a second pass, of the frames that neither draft has lost."""
             residual, both = one.current("residual"), np.flatnonzero(~(draft.lost | one.lost))
             again = tracker.second_pass(
@@ -265,7 +266,7 @@ class _Finisher:
             rows = np.flatnonzero(np.isin(frames, list(found)))
             draft.take(rows, [found[int(frame)] for frame in frames[rows]])
 
-    def _tracked_by(self, tracker: TwoPassTracker, draft: Draft, unused: NDArray[np.bool_]) -> Draft:
+    def _tracked_by(self, tracker: RegionTracker, draft: Draft, unused: NDArray[np.bool_]) -> Draft:
         """Track the frames of a draft by a tracker that has been started, without the cameras (F, C) that are unused;
         return the draft of it."""
         present = np.flatnonzero(draft.result.status != Status.ABSENT)

@@ -28,8 +28,9 @@ from tk.run.delays import COMPARED
 from tk.trackers.camera_monitor import CameraMonitor
 from tk.trackers.contour_finder import COARSE_ROWS
 from tk.trackers.judgement import FrameJudge
-from tk.trackers.protocol import Estimate, Frame, TwoPassTracker, shows_person, usable
+from tk.trackers.protocol import Estimate, Frame, shows_person, usable
 from tk.trackers.reason import is_lost
+from tk.trackers.region import RegionTracker
 from tk.trackers.residual import RECENT
 
 Float = NDArray[np.float64]
@@ -39,7 +40,7 @@ Float = NDArray[np.float64]
 _LEFT_OUT = 0.1
 
 
-TrackerAndMasks = tuple[TwoPassTracker, MaskStore]
+TrackerAndMasks = tuple[RegionTracker, MaskStore]
 """A tracker with the cameras of a run, and the masks of the frames with the delays of the run."""
 
 
@@ -65,7 +66,7 @@ class Run:
         residual: (F, C, 2), NaN for a camera that was left out.
     """
 
-    tracker: TwoPassTracker
+    tracker: RegionTracker
     masks: MaskStore
     frames: NDArray[np.int64]
     poses: Float

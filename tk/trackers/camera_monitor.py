@@ -43,7 +43,7 @@ from tk.trackers.judgement import (
     all_left_out,
     likelihoods,
 )
-from tk.trackers.protocol import Estimate, Frame, Tracker, shows_person, usable, without_cameras
+from tk.trackers.protocol import Estimate, Frame, Tracker, shows_person, two_pass, usable, without_cameras
 from tk.trackers.reason import Reason, is_lost
 from tk.trackers.region import RegionTracker
 
@@ -145,7 +145,7 @@ class CameraMonitor(Stateful[MonitorState]):
         C = len(self._names)
         self.doubted = np.zeros(C, bool)
         self._cameras = Cameras(C, setup.fps)
-        self._region = region = tracker if isinstance(tracker, RegionTracker) else None  # only this one has residuals
+        self._region = region = two_pass(tracker)  # only this one has residuals
         self._frames = FrameJudge(tracker, C, setup.fps, region.region_settings.false_alarm if region else 0.5)
         self._spans: dict[str, Span] = {}
         self._opening_reasons: dict[int, str] = {}

@@ -16,15 +16,11 @@ from tk.trackers.reason import Reason, known_sigma, status_of
 
 if TYPE_CHECKING:  # the process that decodes and segments needs no parts of a tracker
     from tk.model.body.cone_body import ConeBody
-    from tk.model.cameras.camera import Rig
-    from tk.model.cameras.tracker_frame import TrackerFrame
-    from tk.model.cues.cue import Measured
-    from tk.model.cues.part_colors import LearnedColors, RenderedBody
-    from tk.model.cues.ray_costs import RayGrid
     from tk.model.hull.hull import HullSurface
-    from tk.model.masks.silhouettes import Views
     from tk.model.setup import Setup, Subject
     from tk.settings import Settings
+    from tk.trackers.contour_tracker import ContourTracker
+    from tk.trackers.region import RegionTracker
 
 Float = NDArray[np.float64]
 
@@ -159,8 +155,10 @@ class Tracker(Protocol):
         can_exclude_cameras: whether an empty mask excludes its camera. In a visual hull it would remove the subject.
         reports_sigma: whether estimates have sigma and residual.
         has_segments: whether segments, feet, joint angles and a smoothed copy are derived from its poses.
-        has_second_pass: whether it is a :class:`TwoPassTracker`.
-        tracks_among_others: whether it is a :class:`SharingTracker`. A visual hull needs whole masks.
+        has_second_pass: whether it goes over the frames a second time when all of them are known, as
+            :class:`~tk.trackers.region.RegionTracker`.
+        tracks_among_others: whether it does without the pixels of other people, see :class:`Frame`, as
+            :class:`~tk.trackers.contour_tracker.ContourTracker`. A visual hull needs whole masks.
     """
 
     State: ClassVar[type[Any]]
@@ -224,145 +222,14 @@ class Tracker(Protocol):
         ...
 
 
-class SharingTracker(Tracker, Protocol):
-    """A tracker that does without the pixels of other people, see :class:`Frame`.
-
-    Attributes:
-        fine_grid: the grid on which its body is rendered.
-        coarse_grid: that of :attr:`Estimate.drawn`.
-    """
-
-    fine_grid: RayGrid
-    coarse_grid: RayGrid
-
-    def sighted(self, landmarks: Float) -> RenderedBody | None:
-        """Return an average body on the grid :attr:`fine_grid`, at the pose that a person's landmarks (C, L, 4) show;
-        None if no two images agree on them."""
-        ...
-
-    def rendered(self, ahead: bool) -> RenderedBody:
-        """Return the body on the grid, with its colours: at the last pose, or at the one expected in the next frame."""
-        ...
-
-    def last_poses(self) -> tuple[Float, Float]:
-        """Return the poses (D,) of the last frame and of the frame before, in the tracker's frame."""
-        ...
-
-    def learned(self) -> LearnedColors | None:
-        """Return the learned colours, the field ``colors`` of the state; None before any are known."""
-        ...
-
-    def likeness(self, frame: Frame, learned: LearnedColors | None = None, pose: Float | None = None) -> float:
-        """Return the log-likelihood, mean per pixel, that a frame shows this person: by the colours, and by the body if
-        a pose (D,) is given."""
-        ...
-
-    def lose(self) -> None:
-        """Take the last frame for lost: the person is searched for in the next one."""
-        ...
-
-
-class TwoPassTracker(Tracker, Protocol):
-    """A tracker that goes over the frames a second time when all of them are known."""
-
-    rig: Rig
-    world: TrackerFrame
-    views: Views
-
-    def cleaned(self, masks: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return masks (C, H, W) without specks and small holes, as :meth:`second_pass` takes them."""
-        ...
-
-    def kept(self, frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.uint16] | None]:
-        """Return what a second pass needs of a frame that was tracked: masks and colors as in :class:`Estimate`."""
-        ...
-
-    def with_cameras(self, rig: Rig) -> TwoPassTracker:
-        """Return a tracker of the same body with other cameras."""
-        ...
-
-    def start_at(self, pose: Float) -> None:
-        """Continue at a pose (D,); forget residuals and hypotheses, keep the body and its colours."""
-        ...
-
-    def trajectory_cost(self, masks: Sequence[NDArray[np.uint8]], poses: Float, measured: Measured) -> float:
-        """Return the negative logarithm of the posterior of poses (N, D), mean over the frames, nats: a body that does
-        not fit errs in all of them alike.
-
-        Args:
-            masks: (C, H, W) of N frames, cleaned.
-            poses: (N, D).
-            measured: of N frames, see :mod:`tk.model.cues.cue`.
-        """
-        ...
-
-    def headings(
-        self, masks: Sequence[NDArray[np.uint8]], poses: Float, height_m: float | None, measured: Measured
-    ) -> tuple[TwoPassTracker, ...]:
-        """Return two trackers, whose bodies are fitted to a person with the heading of the poses, and with the opposite
-        one; none if the opposite heading is improbable (1e-3). Arguments as for :meth:`trajectory_cost`, and the
-        subject's height if known."""
-        ...
-
-    def turned_pose(self, pose: Float) -> Float:
-        """Return a pose (D,) with the opposite heading and the limbs in the same places."""
-        ...
-
-    def following(
-        self,
-        masks: Sequence[NDArray[np.uint8]],
-        poses: Float,
-        lost: NDArray[np.bool_],
-        residual: Float,
-        measured: Measured | None = None,
-    ) -> tuple[Float, Float]:
-        """Optimise every frame by itself, from poses that other cameras, or masks of other instants, have given.
-
-        Arguments as for :meth:`second_pass`; return poses (F, D) and residuals (F, C, 2).
-        """
-        ...
-
-    def second_pass(
-        self,
-        masks: Sequence[NDArray[np.uint8]],
-        poses: Float,
-        lost: NDArray[np.bool_],
-        residual: Float,
-        height_m: float | None,
-        measured: Measured | None = None,
-        modes: Float | None = None,
-        colors: Sequence[NDArray[np.uint16] | None] | None = None,
-        keep_body: bool = False,
-        report: Callable[[float], None] = lambda _: None,
-    ) -> tuple[Float, Float, Float]:
-        """Optimise frames again with what all of them show, and with a body fitted to all of them.
-
-        Args:
-            masks: (C, H, W) of F frames, cleaned.
-            poses: (F, D) of the first pass.
-            lost: (F,) bool; such frames are not used and do not change.
-            residual: (F, C, 2) of the first pass; NaN where a camera was excluded.
-            height_m: the subject's height, if known.
-            measured: of F frames, in the first pass; None: nothing.
-            modes: (F, M, D) other poses of the limbs that the first pass left open, as in :class:`Estimate`.
-            colors: (C, h, w) of F frames, as in :class:`Estimate`; None where they are not known.
-            keep_body: leave the body as it is.
-            report: receives the share of the work that is done.
-
-        Returns:
-            Poses (F, D), residuals (F, C, 2), and sigma (F, 15) in metres, 0 in lost frames.
-        """
-        ...
-
-
-def two_pass(tracker: Tracker) -> TwoPassTracker | None:
+def two_pass(tracker: Tracker) -> RegionTracker | None:
     """Return the tracker if it has a second pass, else None."""
-    return cast(TwoPassTracker, tracker) if tracker.has_second_pass else None
+    return cast("RegionTracker", tracker) if tracker.has_second_pass else None
 
 
-def sharing(tracker: Tracker) -> SharingTracker | None:
+def sharing(tracker: Tracker) -> ContourTracker[Any] | None:
     """Return the tracker if it can track a person among others, else None."""
-    return cast(SharingTracker, tracker) if tracker.tracks_among_others else None
+    return cast("ContourTracker[Any]", tracker) if tracker.tracks_among_others else None
 
 
 def shows_person(masks: NDArray[np.uint8]) -> NDArray[np.bool_]:

@@ -175,12 +175,19 @@ class RegionTracker(ContourTracker[RegionState]):
         self._reset()
 
     def turned_pose(self, pose: Float) -> Float:
-        """See :class:`~tk.trackers.protocol.TwoPassTracker`."""
+        """Return a pose (D,) with the opposite heading and the limbs in the same places."""
         inside = turned(self.world.poses_in(pose[None])[0], self.limbs)
         return np.asarray(self.world.poses_out(inside[None])[0])
 
     def trajectory_cost(self, masks: Sequence[NDArray[np.uint8]], poses: Float, measured: Measured) -> float:
-        """See :class:`~tk.trackers.protocol.TwoPassTracker`."""
+        """Return the negative logarithm of the posterior of poses (N, D), mean over the frames, nats: a body that does
+        not fit errs in all of them alike.
+
+        Args:
+            masks: (C, H, W) of N frames, cleaned.
+            poses: (N, D).
+            measured: of N frames, see :mod:`tk.model.cues.cue`.
+        """
         inside = self.world.poses_in(poses)
         seen = self._pyramids(masks, measured)
         cost = np.mean([self.cost(pyramid, pose[None])[0] for pyramid, pose in zip(seen, inside, strict=True)])
@@ -194,7 +201,9 @@ class RegionTracker(ContourTracker[RegionState]):
     def headings(
         self, masks: Sequence[NDArray[np.uint8]], poses: Float, height_m: float | None, measured: Measured
     ) -> tuple[RegionTracker, ...]:
-        """See :class:`~tk.trackers.protocol.TwoPassTracker`."""
+        """Return two trackers, whose bodies are fitted to a person with the heading of the poses, and with the opposite
+        one; none if the opposite heading is improbable (1e-3). Arguments as for :meth:`trajectory_cost`, and the
+        subject's height if known."""
         seen, inside = self._pyramids(masks, measured), self.world.poses_in(poses)
         both = np.array([
             self.settle(pyramid, np.stack([pose, turned(pose, self.limbs)])).states
@@ -322,7 +331,8 @@ class RegionTracker(ContourTracker[RegionState]):
         return self.see(frame, seen.images, replace(pyramid, measured={**pyramid.measured, landmarks.NAME: marked}))
 
     def kept(self, frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.uint16] | None]:
-        """See :class:`~tk.trackers.protocol.TwoPassTracker`."""
+        """Return what a second pass needs of a frame that was tracked: masks and colors as in
+        :class:`~tk.trackers.protocol.Estimate`."""
         seen = self.see(self.without_foreign(frame))
         return seen.pyramid.masks[0], seen.evidence.packed_colors()
 
@@ -533,7 +543,10 @@ class RegionTracker(ContourTracker[RegionState]):
         residual: Float,
         measured: Measured | None = None,
     ) -> tuple[Float, Float]:
-        """See :class:`~tk.trackers.protocol.TwoPassTracker`."""
+        """Optimise every frame by itself, from poses that other cameras, or masks of other instants, have given.
+
+        Arguments as for :meth:`second_pass`; return poses (F, D) and residuals (F, C, 2).
+        """
         inside = self.world.poses_in(poses)
         again = SecondPass(self, masks, measured or {}, None, None, inside, lost, residual, lambda _: None)
         again.follow()
@@ -552,7 +565,25 @@ class RegionTracker(ContourTracker[RegionState]):
         keep_body: bool = False,
         report: Callable[[float], None] = lambda _: None,
     ) -> tuple[Float, Float, Float]:
-        """See :class:`~tk.trackers.protocol.TwoPassTracker` and :mod:`tk.trackers.second_pass`."""
+        """Optimise frames again with what all of them show, and with a body fitted to all of them, see
+        :mod:`tk.trackers.second_pass`.
+
+        Args:
+            masks: (C, H, W) of F frames, cleaned.
+            poses: (F, D) of the first pass.
+            lost: (F,) bool; such frames are not used and do not change.
+            residual: (F, C, 2) of the first pass; NaN where a camera was excluded.
+            height_m: the subject's height, if known.
+            measured: of F frames, in the first pass; None: nothing.
+            modes: (F, M, D) other poses of the limbs that the first pass left open, as in
+                :class:`~tk.trackers.protocol.Estimate`.
+            colors: (C, h, w) of F frames, likewise; None where they are not known.
+            keep_body: leave the body as it is.
+            report: receives the share of the work that is done.
+
+        Returns:
+            Poses (F, D), residuals (F, C, 2), and sigma (F, 15) in metres, 0 in lost frames.
+        """
         if lost.all():
             return poses, residual, np.zeros((len(poses), len(JOINTS)))
         inside = self.world.poses_in(poses)
