@@ -387,7 +387,7 @@ def test_person_whose_size_contradicts_the_given_height_is_refused(scene: Scene)
 class Jumping:
     """A tracker whose estimate jumps in one frame."""
 
-    can_exclude_cameras = tracks_among_others = False
+    can_exclude_cameras = tracks_among_others = has_second_pass = False
 
     def __init__(self, joints: np.ndarray, when: int) -> None:
         self.joints, self.when = joints, when

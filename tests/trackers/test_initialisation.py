@@ -131,7 +131,7 @@ def test_poses_with_similar_costs_in_one_frame_all_become_hypotheses(monkeypatch
         tracker, "settle", lambda _, starts, *__: BatchSolution(np.array(starts), np.zeros(3, np.int32))
     )
     starts = tracker.world.poses_in(np.array([wrong, *3 * [right]]))
-    monkeypatch.setattr("tk.trackers.proposals.anywhere.gait.figures", lambda *_: starts)
+    monkeypatch.setattr("tk.trackers.proposals.anywhere.gait.gait_figures", lambda *_: starts)
     monkeypatch.setattr("tk.trackers.proposals.opposite.propose", lambda *_: starts)
     costs = {False: 20.0, True: 20.5}
     inside = tracker.world.poses_in(right)
@@ -285,7 +285,7 @@ def test_start_with_landmarks_begins_with_their_pose(monkeypatch) -> None:
     tracker = tracker_of()
     frame = Frame(0, np.zeros(0, np.uint8), masks, landmarks=landmarks_of(RIG, BODY, pose, 0.02)[None])
     far = placed(standing_pose(SKELETON), 6.0)
-    monkeypatch.setattr("tk.trackers.proposals.anywhere.gait.figures", lambda *_: np.array([far]))
+    monkeypatch.setattr("tk.trackers.proposals.anywhere.gait.gait_figures", lambda *_: np.array([far]))
     found = find_person(tracker, [tracker.see(frame)])[0].poses
     assert error(tracker.world.points_out(SKELETON.joints(found)), pose[None])[0] < 0.04
 
