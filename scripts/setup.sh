@@ -1,10 +1,11 @@
 #!/usr/bin/env bash
 # Make a virtual environment with tk and all that its development needs: setup.sh VENV
-# Only what some tests need: setup.sh --browser (those of the report), setup.sh --display (those of tk view)
+# Only what some tests need: setup.sh --browser (those of the report), setup.sh --display (those of tk view),
+# setup.sh --ffmpeg (one of tk sync)
 # On Debian and Ubuntu, missing system packages are installed if we are root and named if we are not.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-venv=${1:?usage: scripts/setup.sh VENV | --browser | --display}
+venv=${1:?usage: scripts/setup.sh VENV | --browser | --display | --ffmpeg}
 
 say() { echo "setup: $*" >&2; }
 die() { say "$*"; exit 1; }
@@ -37,6 +38,10 @@ case $venv in
     ;;
   --display) # an X server that draws into memory; brings OpenGL without a graphics card
     command -v Xvfb >/dev/null || for_tests Xvfb xvfb
+    exit
+    ;;
+  --ffmpeg) # the command, which cuts a file between two key frames
+    command -v ffmpeg >/dev/null || for_tests FFmpeg ffmpeg
     exit
     ;;
 esac

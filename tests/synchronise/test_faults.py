@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 from collections.abc import Sequence
 from dataclasses import replace
@@ -169,6 +170,7 @@ def test_chapter_that_nothing_confirms_is_named() -> None:
     assert unchecked_chapters(every, signals, clocks(), (heard,)) == []
 
 
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="no FFmpeg is installed (Debian's package: ffmpeg)")
 def test_sound_of_a_file_that_was_cut_between_two_images_is_in_the_time_of_its_images(tmp_path: Path) -> None:
     """FFmpeg gives the first image that is shown the time 0; the sound begins 0.03 s before it."""
     whole, cut = tmp_path / "whole.mp4", tmp_path / "cut.mp4"
