@@ -24,6 +24,7 @@ from tk.model.body.limb_candidates import exchanged_limbs, pairs, turned
 from tk.model.body.skeleton import JOINTS
 from tk.model.cues.landmarks import NAME
 from tk.model.cues.landmarks import points as landmark_places
+from tk.trackers.headings import both_headings, trajectory_cost, turned_pose
 
 
 def seen_at(pose: np.ndarray, noise_m: float = 0.03) -> np.ndarray:
@@ -154,11 +155,11 @@ def test_second_pass_corrects_legs_by_landmarks_of_all_cameras() -> None:
 def test_landmarks_decide_about_the_opposite_heading() -> None:
     """The masks show the person in both headings."""
     tracker = tracker_at(POSES[0])
-    turned = tracker.turned_pose(POSES[0])
+    turned = turned_pose(tracker, POSES[0])
     masks = draw_silhouettes(BODY, RIG, np.stack([POSES[0], turned])).max(axis=0)
-    assert len(tracker.headings([masks], POSES[:1], None, {})) == 2
-    assert tracker.headings([masks], POSES[:1], None, {NAME: seen_at(POSES[0])}) == ()
-    both = [tracker.trajectory_cost([masks], pose[None], {NAME: seen_at(turned)}) for pose in (POSES[0], turned)]
+    assert len(both_headings(tracker, [masks], POSES[:1], None, {})) == 2
+    assert both_headings(tracker, [masks], POSES[:1], None, {NAME: seen_at(POSES[0])}) == ()
+    both = [trajectory_cost(tracker, [masks], pose[None], {NAME: seen_at(turned)}) for pose in (POSES[0], turned)]
     assert both[1] < both[0] - 10.0
 
 

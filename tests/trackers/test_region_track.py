@@ -34,6 +34,7 @@ from tk.run.plan import recording_task
 from tk.run.session import Summary, estimates
 from tk.run.task import RecordingOptions, Task
 from tk.trackers.bodies import body_and_poses, read_body
+from tk.trackers.headings import turned_pose
 from tk.trackers.protocol import Estimate, Frame
 from tk.trackers.reason import Reason
 from tk.trackers.region import RegionTracker
@@ -277,7 +278,7 @@ def test_a_person_who_was_tracked_back_to_front_is_tracked_again(
     def start_turned(tracker: RegionTracker, frames: Sequence[Frame], subject: Subject) -> None:
         start(tracker, frames, subject)
         pose = tracker.world.poses_out(tracker.last_poses()[0][None])[0]
-        tracker.start_at(tracker.turned_pose(pose))
+        tracker.start_at(turned_pose(tracker, pose))
 
     monkeypatch.setattr(RegionTracker, "start", start_turned)
     run(unposed, tmp_path / "proposed.h5", causal=True, frames=(0, 2))

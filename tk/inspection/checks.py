@@ -127,10 +127,11 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
         Sample(i, read.images[i], masks[i], _silhouettes(hulls[frames.tolist().index(i)], good), compare.step)
         for i in kept.tolist()
     ]
-    moved = [line for i in kept[:1] for line in _moved_since_empty(capture, read.images[int(i)], masks[int(i)])]
+    empty = capture.background() or ()
+    moved = [line for i in kept[:1] for line in _moved_since_empty(capture, empty, read.images[int(i)], masks[int(i)])]
     denied = bool(by_masks.refusal or by_masks.wrong) and not (agreement.refusal or agreement.wrong)
-    scene = [] if capture.has_masks else _somebody_in_empty(Task.of(capture, config), capture.background())
-    findings = [*scene, *moved, *_findings(inspection, capture, agreement, denied)]
+    somebody = [] if capture.has_masks else _somebody_in_empty(Task.of(capture, config), empty)
+    findings = [*somebody, *moved, *_findings(inspection, capture, agreement, denied)]
     if not agreement.wrong:  # a wrong camera makes one person look like several
         findings += many_people(people, entered)
     return replace(inspection, findings=tuple([unrelated, *findings] if unrelated else findings)), seen
@@ -244,10 +245,12 @@ def _camera(
     )
 
 
-def _moved_since_empty(capture: Capture, images: NDArray[np.uint8], masks: Masks) -> list[str]:
+def _moved_since_empty(
+    capture: Capture, scene: Sequence[NDArray[np.uint8]], images: NDArray[np.uint8], masks: Masks
+) -> list[str]:
     """Return a line for each camera whose image differs from that of its empty scene by a shift."""
     lines = []
-    for camera, empty, image, mask in zip(capture.rig, capture.background() or (), images, masks, strict=False):
+    for camera, empty, image, mask in zip(capture.rig, scene, images, masks, strict=False):
         h, w = empty.shape[1:3]
         moved = shift_between(empty[0], image[:h, :w], mask[:h, :w])
         if moved > MOST_SHIFT:
@@ -258,13 +261,13 @@ def _moved_since_empty(capture: Capture, images: NDArray[np.uint8], masks: Masks
     return lines
 
 
-def _somebody_in_empty(task: Task, empty: Sequence[NDArray[np.uint8]] | None) -> list[str]:
+def _somebody_in_empty(task: Task, scene: Sequence[NDArray[np.uint8]]) -> list[str]:
     """Return a line if a network finds a person in two or more images of the empty scene, inside the working volume:
     what the person hides there is no background."""
-    if empty is None:
+    if not scene:
         return []
-    images = np.zeros((len(empty), *task.setup.rig.frame_shape, 3), np.uint8)
-    for image, clip in zip(images, empty, strict=True):
+    images = np.zeros((len(scene), *task.setup.rig.frame_shape, 3), np.uint8)
+    for image, clip in zip(images, scene, strict=True):
         image[: clip.shape[1], : clip.shape[2]] = clip[0]
     for seen in () if (people := people_in_scene(task, images)) is None else people:
         shown = consensus(task.setup.rig, seen)

@@ -29,6 +29,7 @@ from tk.run.prefetch import open_observations
 from tk.run.refinement import compare_cameras, refine_if_inconsistent
 from tk.run.second_run import Run, explains_better, track_again, track_back
 from tk.run.task import Task
+from tk.trackers.headings import both_headings, trajectory_cost, turned_pose
 from tk.trackers.hypotheses import DROPPED
 from tk.trackers.judgement import FrameEvidence, FrameJudge, depth_known, judge_frames
 from tk.trackers.protocol import Estimate, two_pass, usable
@@ -204,7 +205,6 @@ class _Finisher:
         """If the opposite heading is not improbable, by all frames, track the person again with it and its body; keep
         the more probable one in the draft. Return the tracker of the heading that is kept.
 
-        A few views of a person who stands upright at the start hardly show where the front is; a whole recording does.
         Turned poses are worse than tracked ones. So they may refute the opposite heading, not confirm it.
         """
         (tracker, masks), height_m = draft.tracker_and_masks, draft.person.subject.height_m
@@ -234,15 +234,15 @@ class _Finisher:
                 report=self.within,
             )
             shown, known = seen(both)
-            return tracker.trajectory_cost(shown, again[0][both], known)
+            return trajectory_cost(tracker, shown, again[0][both], known)
 
         shown, known = seen(rows)
-        headings = tracker.headings(shown, poses[rows], height_m, known)
+        headings = both_headings(tracker, shown, poses[rows], height_m, known)
         if not headings:
             return tracker
         present, opposite = headings
         _LOG.info("comparing both headings: which way the person faces is unclear")
-        turned = np.array([tracker.turned_pose(pose) for pose in poses])
+        turned = np.array([turned_pose(tracker, pose) for pose in poses])
         least = cost(present, poses, draft)
         if cost(opposite, turned, draft) > least + DROPPED:
             return tracker

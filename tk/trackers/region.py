@@ -29,14 +29,12 @@ from numpy.typing import NDArray
 from tk.io.results.status import Status
 from tk.kernels.mask_values import PERSON
 from tk.kernels.silhouette import normal_equations
-from tk.model.body.body_fit import STATURE_DEVIATION
-from tk.model.body.body_parameters import FITTED_STATURE_DEVIATION
 from tk.model.body.joint_sigma import CHANGING_M, directions, pose_variance, posture_variance
-from tk.model.body.limb_candidates import Limb, turned
+from tk.model.body.limb_candidates import Limb
 from tk.model.body.skeleton import JOINTS, distinct
 from tk.model.cameras.camera import Rig
 from tk.model.cues import landmarks
-from tk.model.cues.cue import CONTOUR_INFORMATION, Measured, in_frames
+from tk.model.cues.cue import CONTOUR_INFORMATION, Measured
 from tk.model.cues.part_colors import LearnedColors, color_bins
 from tk.model.cues.ray_costs import Evidence
 from tk.model.masks.mosaic import doubled
@@ -48,7 +46,7 @@ from tk.optim.quadratic import Quadratic
 from tk.settings import RegionSettings, Settings, SilhouetteSettings
 from tk.trackers.contour_finder import Seen
 from tk.trackers.contour_tracker import ContourTracker
-from tk.trackers.hypotheses import DROPPED, PROPOSED, RENEWAL, SAME_POSE_M, Hypothesis, disagreement, walking
+from tk.trackers.hypotheses import DROPPED, RENEWAL, SAME_POSE_M, Hypothesis, disagreement
 from tk.trackers.judgement import RECOVER_EVERY, Match, depth_known
 from tk.trackers.proposals import exchanged, limbs
 from tk.trackers.proposals import landmarks as of_landmarks
@@ -173,56 +171,6 @@ class RegionTracker(ContourTracker[RegionState]):
         self._alive = [Hypothesis(pose, pose, 0.0, 1)]
         self._fresh = False
         self._reset()
-
-    def turned_pose(self, pose: Float) -> Float:
-        """Return a pose (D,) with the opposite heading and the limbs in the same places."""
-        inside = turned(self.world.poses_in(pose[None])[0], self.limbs)
-        return np.asarray(self.world.poses_out(inside[None])[0])
-
-    def trajectory_cost(self, masks: Sequence[NDArray[np.uint8]], poses: Float, measured: Measured) -> float:
-        """Return the negative logarithm of the posterior of poses (N, D), mean over the frames, nats: a body that does
-        not fit errs in all of them alike.
-
-        Args:
-            masks: (C, H, W) of N frames, cleaned.
-            poses: (N, D).
-            measured: of N frames, see :mod:`tk.model.cues.cue`.
-        """
-        inside = self.world.poses_in(poses)
-        seen = self._pyramids(masks, measured)
-        cost = np.mean([self.cost(pyramid, pose[None])[0] for pyramid, pose in zip(seen, inside, strict=True)])
-        return float(cost + walking(self.body.skeleton, inside))
-
-    def _pyramids(self, masks: Sequence[NDArray[np.uint8]], measured: Measured) -> list[Pyramid]:
-        """Return what frames show, arguments as for :meth:`trajectory_cost`."""
-        scales = self.solver.scales
-        return [self.views.pyramid(m, scales, False, in_frames(measured, i)) for i, m in enumerate(masks)]
-
-    def headings(
-        self, masks: Sequence[NDArray[np.uint8]], poses: Float, height_m: float | None, measured: Measured
-    ) -> tuple[RegionTracker, ...]:
-        """Return two trackers, whose bodies are fitted to a person with the heading of the poses, and with the opposite
-        one; none if the opposite heading is improbable (1e-3). Arguments as for :meth:`trajectory_cost`, and the
-        subject's height if known."""
-        seen, inside = self._pyramids(masks, measured), self.world.poses_in(poses)
-        both = np.array([
-            self.settle(pyramid, np.stack([pose, turned(pose, self.limbs)])).states
-            for pyramid, pose in zip(seen, inside, strict=True)
-        ])  # fmt: skip
-        present, opposite = (np.mean(list(map(self.cost, seen, one[:, None]))) for one in both.swapaxes(0, 1))
-        if opposite > present + PROPOSED:
-            return ()
-        for i, (shown, pyramid) in enumerate(zip(masks, seen, strict=True)):
-            frame = Frame(i, np.empty((len(shown), 0, 0, 3), np.uint8), shown)
-            both[i, 1] = self.improved(self.see(frame, pyramid=pyramid), both[i, 1])
-        stature = height_m or self.body.dimensions.barefoot
-        deviation = STATURE_DEVIATION if height_m else FITTED_STATURE_DEVIATION
-        trackers, costs = (self.with_cameras(self.rig), self.with_cameras(self.rig)), []
-        for tracker, one in zip(trackers, both.swapaxes(0, 1), strict=True):
-            fitted = self.fit(seen, one, np.arange(len(seen)), stature, deviation)
-            tracker.take_body(fitted.body)
-            costs.append(tracker.trajectory_cost(masks, self.world.poses_out(fitted.poses), measured))
-        return trackers if costs[1] < costs[0] + DROPPED else ()
 
     def step(self, frame: Frame) -> Estimate:
         watch = Stopwatch()

@@ -31,7 +31,8 @@ T = TypeVar("T")
 
 #: most bytes in memory; larger stores are on disk
 IN_MEMORY = 32_000_000
-#: frames of a sequence whose masks lie one after the other, as the second pass takes them
+#: frames of a sequence whose masks lie one after the other: as many as the second pass optimises in one launch
+#: (:data:`tk.trackers.alternatives.AT_ONCE`), which joins them without a copy
 TOGETHER = 16
 
 
