@@ -394,6 +394,15 @@ def test_second_pass_corrects_a_wrong_body() -> None:
     assert np.mean(off) < CLOSE_M
 
 
+def test_second_pass_fits_the_body_if_the_opening_has_many_frames() -> None:
+    frames = 80
+    tracker = tracker_at(POSES[0], settings=replace(SETTINGS, adapt=True, init_frames=frames))
+    masks, poses = (np.repeat(one[:1], frames, axis=0) for one in (MASKS, POSES))
+    result, _, _ = tracker.second_pass(masks, poses, np.zeros(frames, bool), np.zeros((frames, 3, 2)), STATURE)
+    off = np.linalg.norm(tracker.body.skeleton.joints(result) - SKELETON.joints(poses), axis=-1)
+    assert off.mean() < CLOSE_M
+
+
 def test_second_pass_corrects_the_frames_before_a_limb_was_found() -> None:
     raised = np.array([with_arm(pose, "l", (0.1, 1.0, 0.3), 15.0) for pose in POSES])
     masks = draw_silhouettes(BODY, RIG, raised)
@@ -560,9 +569,10 @@ def test_legs_that_took_each_other_s_place_are_found_by_the_routine_search() -> 
     assert off[0.3] < CLOSE_M
 
 
-def test_routine_search_runs_at_intervals() -> None:
+@pytest.mark.parametrize("frames", [range(7), range(6, -1, -1)], ids=["forwards", "backwards"])
+def test_routine_search_runs_at_intervals(frames: range) -> None:
     tracker = tracker_at(POSES[0], settings=replace(SETTINGS, search_every=1 / 3))
-    searched = [bool(tracker.step(observe(MASKS[0], i)).iterations[1]) for i in range(7)]
+    searched = [bool(tracker.step(observe(MASKS[0], i)).iterations[1]) for i in frames]
     assert np.flatnonzero(searched).tolist() == [0, 5]
 
 

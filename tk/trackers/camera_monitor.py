@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError
 from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.body.joint_sigma import CHANGING_M
-from tk.model.body.plausibility import check_extent, check_stature
+from tk.model.body.plausibility import check_extent, check_height, check_stature
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import determine_depth
 from tk.model.cameras.landmark_agreement import evidence_for_cameras
@@ -186,13 +186,16 @@ class CameraMonitor(Stateful[MonitorState]):
         return [without_cameras(f, out | b) for f, b in zip(frames, bad, strict=True)]
 
     def check_body(self) -> None:
-        """Refuse a body of an impossible size, after the tracker's start.
+        """Refuse a body of an impossible size, or of another size than given, after the tracker's start.
 
         Raises:
             CaptureError: with the size and its likely causes.
         """
+        dimensions = self.tracker.body.dimensions
         if self._subject.height_m is None:
-            check_stature(self.tracker.body.dimensions.stature)
+            check_stature(dimensions.stature)
+        else:
+            check_height(dimensions.barefoot, self._subject.height_m)
 
     def step(self, frame: Frame) -> tuple[Estimate, Frame]:
         """Return the estimate for the next frame, and the observation without the excluded cameras."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -31,8 +32,8 @@ class Hypothesis:
 
     Attributes:
         pose, previous: (D,) in this frame and the one before.
-        cost: running mean of its cost, nats.
-        age: frames since it was proposed.
+        cost: running mean of its cost, nats. Only differences between hypotheses have a meaning: what a frame shows
+            changes the costs of all of them.
         jumped: whether a limb search has just found it. ``previous`` is then that of the pose it replaces, so that the
             two may differ by a fast motion or by a jump.
     """
@@ -40,7 +41,6 @@ class Hypothesis:
     pose: Float
     previous: Float
     cost: float
-    age: int = 0
     jumped: bool = False
 
 
@@ -56,13 +56,21 @@ class TrajectoryHypothesis(NamedTuple):
     cost: float
 
 
+def renewed(alive: Sequence[Hypothesis], poses: Float, costs: Float) -> list[Hypothesis]:
+    """Return hypotheses at their poses (H, D) in the next frame, which have costs (H,), nats."""
+    return [
+        Hypothesis(pose, h.pose, h.cost + RENEWAL * float(cost - h.cost))
+        for h, pose, cost in zip(alive, poses, costs, strict=True)
+    ]
+
+
 def disagreement(skeleton: Skeleton, poses: Float, cost: Float) -> Float:
-    """Return (J,) variance of the joints' positions along an axis, metres², over poses (H, D) with costs (H,), nats."""
+    """Return (J,) variance of the joints' positions along an axis, metres², about the likeliest of poses (H, D) with
+    costs (H,), nats."""
     weight = np.exp(cost.min() - cost)
     weight /= weight.sum()
     joints = skeleton.joints(poses)
-    mean = np.einsum("h,hja->ja", weight, joints)
-    return np.asarray(np.einsum("h,hja->j", weight, (joints - mean) ** 2) / 3)
+    return np.asarray(np.einsum("h,hja->j", weight, (joints - joints[cost.argmin()]) ** 2) / 3)
 
 
 def turning(skeleton: Skeleton, poses: Float, before: Float) -> Float:

@@ -405,7 +405,7 @@ class FrameJudge(Stateful[JudgeState]):
         found, begins = estimate.found, estimate.origin == Status.RECOVERED
         if not is_lost(found):
             before = None if begins else self._joints  # the person may be elsewhere, as after a cut
-            found = impossible(estimate.joints, before, max(index - self._index, 1) / self._fps) or found
+            found = impossible(estimate.joints, before, max(abs(index - self._index), 1) / self._fps) or found
             if is_lost(found) and (tracker := sharing(self._tracker)) is not None:
                 tracker.lose()
         if is_lost(found):

@@ -46,7 +46,7 @@ from tk.optim.quadratic import Quadratic
 from tk.settings import RegionSettings, Settings, SilhouetteSettings
 from tk.trackers.contour_finder import Seen
 from tk.trackers.contour_tracker import ContourTracker
-from tk.trackers.hypotheses import DROPPED, RENEWAL, SAME_POSE_M, Hypothesis, disagreement
+from tk.trackers.hypotheses import DROPPED, RENEWAL, SAME_POSE_M, Hypothesis, disagreement, renewed
 from tk.trackers.judgement import RECOVER_EVERY, Match, depth_known
 from tk.trackers.proposals import exchanged, limbs
 from tk.trackers.proposals import landmarks as of_landmarks
@@ -168,7 +168,7 @@ class RegionTracker(ContourTracker[RegionState]):
     def start_at(self, pose: Float) -> None:
         """Continue at a pose (D,) of the setup's world, with the same body and colours, but no memory of residuals."""
         pose = self.world.poses_in(pose[None])[0]
-        self._alive = [Hypothesis(pose, pose, 0.0, 1)]
+        self._alive = [Hypothesis(pose, pose, 0.0)]
         self._fresh = False
         self._reset()
 
@@ -191,10 +191,7 @@ class RegionTracker(ContourTracker[RegionState]):
         if not np.isfinite(mismatch).all():
             return self._nobody(frame, watch)
         costs = evidence.cost_of(mismatch, poses)
-        self._alive = [
-            Hypothesis(pose, h.pose, h.cost + RENEWAL * (c - h.cost) if h.age else float(c), h.age + 1)
-            for h, pose, c in zip(self._alive, poses, costs, strict=True)
-        ]
+        self._alive = renewed(self._alive, poses, costs)
         self._rank()
         i = int(np.argmin([np.abs(pose - self._best.pose).max() for pose in poses]))
         look = _Look(met.label[i], evidence.residual(met.label[i]))
@@ -238,7 +235,8 @@ class RegionTracker(ContourTracker[RegionState]):
             self._learn(evidence, look)
         origin = self._origin(cut)
         if not is_lost(reason):
-            self._refused = 0
+            self._refused, self._postures = 0, self._postures + 1
+            self._mean_posture += (directions(self.body.skeleton, pose) - self._mean_posture) / self._postures
         elif reason == Reason.STILL_HIGH:
             self._refused += 1
         self._lost_for = self._lost_for + 1 if is_lost(reason) else 0
@@ -353,14 +351,13 @@ class RegionTracker(ContourTracker[RegionState]):
     def _rank(self) -> None:
         """Sort the hypotheses by cost; drop those that are improbable beside the best, or equal."""
         if len(self._alive) == 1:
-            self._alive = [replace(self._alive[0], age=1)]
             return
         ranked = sorted(self._alive, key=lambda h: h.cost)
         ranked = [h for h in ranked if h.cost <= ranked[0].cost + DROPPED]
         kept = distinct(
             self.body.skeleton.joints(np.array([h.pose for h in ranked])), SAME_POSE_M, self.region_settings.hypotheses
         )
-        self._alive = [replace(ranked[0], age=1), *(ranked[i] for i in kept[1:])]
+        self._alive = [ranked[i] for i in kept]
 
     def misplaced(self, evidence: Evidence, label: NDArray[np.uint8]) -> tuple[Limb, ...]:
         """Return the limbs of which a large part lies outside the mask, or on colours that are not theirs."""
@@ -376,7 +373,7 @@ class RegionTracker(ContourTracker[RegionState]):
         The poses that a search has proposed compete for :data:`RECOVER_EVERY` frames before a limb that is still
         misplaced is searched for again.
         """
-        since, every = frame.index - self._searched, self.search_frames
+        since, every = abs(frame.index - self._searched), self.search_frames  # also backwards
         if self.residuals.high(look.error) or (misplaced and since >= RECOVER_EVERY):
             return True
         doubtful = hidden > HIDDEN and self.residuals.mean_excess(look.error) > DOUBTFUL
@@ -428,8 +425,6 @@ class RegionTracker(ContourTracker[RegionState]):
         prior = self.prior(pose[None])
         hessian, _ = self.equations(seen.pyramid, pose[None], prior, self.view_m, seen.images)
         variance = self.variance(pose, np.linalg.inv(hessian[0]), look.residual)
-        self._postures += 1
-        self._mean_posture += (directions(skeleton, pose) - self._mean_posture) / self._postures
         variance += posture_variance(skeleton, pose, self._mean_posture) + self._spread
         variance += self.cue_variance(seen.pyramid, pose[None])[0]
         if len(self._alive) > 1:

@@ -117,7 +117,7 @@ class SecondPass:
     def fit_body(self, height_m: float | None) -> None:
         """Fit the tracker's body to frames of the opening and to the best frames of all stretches."""
         tracker, tracked = self.tracker, self.tracked
-        opening = tracked[: tracker.opening_frames : 3]
+        opening = tracked[: min(tracker.opening_frames, FIT_FRAMES) : 3]
         error = np.nanmean(self.residual[tracked].sum(axis=2), axis=1)
         chosen = np.union1d(opening, _lowest(tracked, error, FIT_FRAMES - len(opening)))
         stature = height_m or tracker.body.dimensions.barefoot

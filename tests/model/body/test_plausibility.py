@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tk.errors import CaptureError
-from tk.model.body.plausibility import check_extent, check_stature
+from tk.model.body.plausibility import check_extent, check_height, check_stature
 
 
 def test_impossible_sizes_are_refused() -> None:
@@ -19,3 +19,11 @@ def test_impossible_sizes_are_refused() -> None:
     for extent in (0.9, 3.0):
         with pytest.raises(CaptureError, match=r"measures .* capture.toml says 1.75 m"):
             check_extent(extent, 1.75)
+
+
+def test_a_height_that_the_fitted_body_contradicts_is_refused() -> None:
+    for fitted in (1.70, 1.75, 1.80):
+        check_height(fitted, 1.75)
+    for fitted, which in ((1.65, "less"), (1.86, "more")):
+        with pytest.raises(CaptureError, match=rf"1\.\d\d m or {which}, .* capture.toml says 1.75 m"):
+            check_height(fitted, 1.75)

@@ -7,7 +7,11 @@ standard deviations below the median). The height of a smaller person is given i
 
 from __future__ import annotations
 
+import math
+
 from tk.errors import CaptureError
+from tk.model.body.body_fit import STATURE_DEVIATION
+from tk.model.cameras.agreement import SIGNIFICANT
 
 # Statures that are accepted if the height is not given, metres: see above.
 STATURE_M = (1.0, 2.3)
@@ -36,6 +40,25 @@ def check_extent(extent_m: float, height_m: float) -> None:
         raise CaptureError(
             f"the person measures {extent_m:.2f} m in the images, but [subject] height in capture.toml says "
             f"{height_m:.2f} m: {_CAUSES}"
+        )
+
+
+def check_height(fitted_m: float, height_m: float) -> None:
+    """Refuse a given height that the fitted body contradicts. The height is the mean of the body's prior, so the fit
+    leaves it only where many silhouettes demand it: cameras that all have too long a focal length show everybody
+    smaller, and each of them agrees with the others about a person between them.
+
+    Args:
+        fitted_m: height of the body without shoes, metres.
+        height_m: the height in `capture.toml`.
+
+    Raises:
+        CaptureError: with the likely causes.
+    """
+    if abs(math.log(fitted_m / height_m)) > SIGNIFICANT * STATURE_DEVIATION:
+        raise CaptureError(
+            f"the silhouettes fit a person of {fitted_m:.2f} m or {'less' if fitted_m < height_m else 'more'}, but "
+            f"[subject] height in capture.toml says {height_m:.2f} m: correct it, or {_CAUSES}"
         )
 
 
