@@ -1,9 +1,15 @@
 """The camera monitor: steps a tracker without the cameras that are wrong, and rejects impossible poses.
 
-Three checks exclude a camera: its image shows nothing, is frozen, or has moved since the first frame, so that the
-calibration is no longer true (:mod:`tk.model.masks.image_health`); in the opening frames its masks contradict those of
-the other cameras (:mod:`tk.model.masks.mask_agreement`); or, in a later frame, its residual is explained best by a
-fault of the camera (:mod:`tk.trackers.judgement`).
+A camera is left out of a frame if
+
+- its image shows nothing, is frozen, or has moved since the first frame, so that the calibration is no longer true
+  (:mod:`tk.model.masks.image_health`);
+- in the opening frames its masks contradict those of the other cameras (:mod:`tk.model.masks.mask_agreement`);
+- its residual in this frame or the last ones is explained best by a fault of the camera (:mod:`tk.trackers.judgement`);
+- the tracker finds nothing of the person in its mask; or
+- only one of the others shows anybody, so that there is no depth (:func:`~tk.trackers.protocol.usable`).
+
+No camera is left out for good: in each frame it is weighed again.
 
 Only contour trackers can go without a camera: a visual hull without one of its masks is empty.
 """

@@ -19,8 +19,9 @@ IEEE*, 1989). A mask in which the tracker finds nothing of the person is no evid
 **Frames.** What a frame itself shows is its first reason: the numbers that the tracker reports (:class:`Match`), or a
 pose that is impossible after the last one (:class:`FrameJudge`). :func:`judge_frames` adds what several frames show
 together: body and masks differ more than in a correct recording, or the cameras do not determine depth. A run asks it
-in each frame with the last frames, and at its end with all of them. What follows from a reason stands in
-:mod:`tk.trackers.reason`.
+in each frame with the last frames, and at its end with all of them. What no single person's frames show, who is who
+and which of two cameras is right, the run adds at its end (:mod:`tk.run.offline`). What follows from a reason, lost,
+suspect or without sigma, stands in :mod:`tk.trackers.reason`.
 """
 
 from __future__ import annotations
@@ -133,7 +134,7 @@ class Cameras(Stateful[Belief]):
         return np.asarray(self._fault > 0)
 
     def accuse(self, camera: int) -> None:
-        """Take it for certain that a camera is wrong."""
+        """Take it for certain that a camera is wrong now; later frames may show that it is right again."""
         self._probability[camera] = 0.0, 0.0, 1.0
 
     def look(self, faults: Sequence[str | None]) -> None:

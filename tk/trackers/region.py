@@ -396,7 +396,7 @@ class RegionTracker(ContourTracker[RegionState]):
     def _is_due(self, by_view: Float) -> bool:
         """Return whether the person is searched for as at the start, because the last frame was lost, or the residual
         (E_S, (V,)) is above the limit or stays high. Searches for the last reason become rarer: after 3, 6, 12 …
-        frames; of a lost person they are in every third frame."""
+        frames. A lost person is searched for in every frame, but above the limit in every third one."""
         error, limit = float(np.nanmean(by_view)), self.settings.lost_error
         self._high_for = self._high_for + 1 if self.residuals.high(by_view) else 0
         waits, rest = divmod(self._high_for, RECOVER_EVERY)

@@ -47,10 +47,10 @@ FIT_FRAMES = 24
 # Iterations over all frames together; frames of which the equations are in memory at once, and frames before and after
 # them that are solved with them: what a frame shows about others fades within some frames.
 ROUNDS, WINDOW, OVERLAP = 2, 1000, 30
-# Clothes, shadows and the shapes of the model err alike as long as the pose is the same. So the likelihood of a frame
-# counts by the share of CORRELATED_M, metres, that the fastest joint moves in it, and at least by its share of STILL_S,
-# seconds: a person who stands still is seen once, not once a frame. CORRELATED_M was chosen on rendered people
-# (docs/experiments.md, Sigma); STILL_S is assumed.
+# Clothes, shadows and the shapes of the model err alike as long as the pose is the same. So what a frame shows, and its
+# prior about the pose of the first pass, count by the share of CORRELATED_M, metres, that the fastest joint moves in
+# it, and at least by its share of STILL_S, seconds: a person who stands still is seen once, not once a frame.
+# CORRELATED_M was chosen on rendered people (docs/experiments.md, Sigma); STILL_S is assumed.
 CORRELATED_M, STILL_S = 0.2, 1.0
 # Bytes of the masks that stay unpacked: those of 244 frames of four VGA cameras. Each frame's are asked for up to
 # twenty times, in the order of time, so those of a longer recording are unpacked each time.

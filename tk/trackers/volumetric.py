@@ -255,7 +255,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
 
     @property
     def body(self) -> ConeBody:
-        """The fitted body; only after :meth:`start` or :meth:`restore`."""
+        """The fitted body; only after :meth:`start`, or with a state of an earlier run."""
         return self._finder.body.standing(self.up)
 
     def _starts(self, surface: HullSurface) -> Float:

@@ -24,6 +24,6 @@ def test_impossible_sizes_are_refused() -> None:
 def test_a_height_that_the_fitted_body_contradicts_is_refused() -> None:
     for fitted in (1.70, 1.75, 1.80):
         check_height(fitted, 1.75)
-    for fitted, which in ((1.65, "less"), (1.86, "more")):
+    for fitted, which in ((1.64, "less"), (1.87, "more")):
         with pytest.raises(CaptureError, match=rf"1\.\d\d m or {which}, .* capture.toml says 1.75 m"):
             check_height(fitted, 1.75)

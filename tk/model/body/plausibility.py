@@ -11,12 +11,14 @@ import math
 
 from tk.errors import CaptureError
 from tk.model.body.body_fit import STATURE_DEVIATION
-from tk.model.cameras.agreement import SIGNIFICANT
 
 # Statures that are accepted if the height is not given, metres: see above.
 STATURE_M = (1.0, 2.3)
 # Greatest extent of a person, in heights: crouched with bent arms (0.55), upright with raised arms (1.5).
 EXTENT = (0.55, 1.5)
+# A given height is contradicted by a body that is so many standard deviations (STATURE_DEVIATION) off: 10 cm, which a
+# hat and thick soles together do not reach, because the fit leaves the given height by a part of that only.
+_CONTRADICTED = 4.0
 
 _CAUSES = "the unit or the scale of calibration.toml is wrong, or the masks show more or less than the person"
 
@@ -55,7 +57,7 @@ def check_height(fitted_m: float, height_m: float) -> None:
     Raises:
         CaptureError: with the likely causes.
     """
-    if abs(math.log(fitted_m / height_m)) > SIGNIFICANT * STATURE_DEVIATION:
+    if abs(math.log(fitted_m / height_m)) > _CONTRADICTED * STATURE_DEVIATION:
         raise CaptureError(
             f"the silhouettes fit a person of {fitted_m:.2f} m or {'less' if fitted_m < height_m else 'more'}, but "
             f"[subject] height in capture.toml says {height_m:.2f} m: correct it, or {_CAUSES}"

@@ -175,7 +175,8 @@ class LandmarkCue:
         return LandmarkRows(*landmark_information(self._arrays, self._numbers, poses))
 
     def cost(self, poses: Float) -> Float:
-        """Return (B,) the same at poses (B, D), nats, up to a constant of the frame.
+        """Return (B,) the negative logarithm of the landmarks' likelihood at poses (B, D), nats, up to a
+        constant of the frame.
 
         The offsets are integrated out by Laplace's method, about the offsets that one step of Newton's gives. They
         explain what all images have in common; a landmark far off in one image is not explained by them.
