@@ -509,7 +509,7 @@ def test_a_person_who_stands_still_is_seen_once_a_second() -> None:
     lost, residual = np.zeros(frames, bool), np.zeros((frames, 3, 2))
     sigma = tracker.second_pass(masks, poses, lost, residual, None, keep_body=True)[2][frames // 2]
     pose, seen = tracker.world.poses_in(POSES[:1]), tracker.views.pyramid(MASKS[0], 1, False)
-    hessian, _ = tracker.equations(seen, pose, tracker.prior(pose, second_pass.ANGLE_DEG), tracker.view_m)
+    hessian, _ = tracker.equations(seen, pose, tracker.prior(pose, second_pass.NEAR_DEG), tracker.view_m)
     single = np.sqrt(pose_variance(tracker.body.skeleton, pose[0], np.linalg.inv(hessian[0])))
     np.testing.assert_allclose(sigma / single, np.sqrt(0.5), rtol=0.15)
 

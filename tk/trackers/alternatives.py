@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 
 # How far a pose of the second pass may be from its start, degrees, and frames that are optimised in one launch.
-ANGLE_DEG, AT_ONCE = 15.0, 16
+NEAR_DEG, AT_ONCE = 15.0, 16
 # Scale at which other poses are optimised.
-LEVEL = 1
+SCALE = 1
 # Frames are compared if they say at least this share of an independent frame; errors with and without it differ by
 # 0.03 cm at most (docs/experiments.md, Running time).
 APART = 0.5
@@ -300,9 +300,9 @@ class Choice:
             own = far & np.array([one.limb is limb for one in alternatives])[:, None]
             if own.any():
                 start, shown = starts[own], frames[np.nonzero(own)[1]]
-                pyramid = Pyramid.of_all([self._shown(i) for i in shown.tolist()], LEVEL)
-                prior = tracker.prior(start, ANGLE_DEG)
-                result[own] = tracker.settle(pyramid, start, (LEVEL,), prior=prior, limb=limb).states
+                pyramid = Pyramid.of_all([self._shown(i) for i in shown.tolist()], SCALE)
+                prior = tracker.prior(start, NEAR_DEG)
+                result[own] = tracker.settle(pyramid, start, (SCALE,), prior=prior, limb=limb).states
         if far.any():
             result = np.where(skeleton.apart(result, joints)[..., None] > SAME_POSE_M, result, present)
         return result

@@ -35,7 +35,7 @@ from tk.model.cues.ray_costs import Evidence, residual_of
 from tk.model.masks.silhouettes import Pyramid, Views
 from tk.model.motion.coupling import MotionTerm
 from tk.optim.trajectory import Equations
-from tk.trackers.alternatives import ANGLE_DEG, AT_ONCE, LEVEL, Choice, apart
+from tk.trackers.alternatives import AT_ONCE, NEAR_DEG, SCALE, Choice, apart
 
 if TYPE_CHECKING:
     from tk.trackers.region import RegionTracker
@@ -131,17 +131,17 @@ class SecondPass:
     def settle(self) -> None:
         """Optimise every frame by itself, near its pose of the first pass."""
         for frames in _chunks(self.tracked):
-            prior = self.tracker.prior(self.poses[frames], ANGLE_DEG)
+            prior = self.tracker.prior(self.poses[frames], NEAR_DEG)
             settled = self.tracker.settle(self._together(frames), self.poses[frames], (0,), prior=prior)
             self.poses[frames] = settled.states
             self._advance(len(frames))
 
     def follow(self) -> None:
-        """Optimise every frame by itself, at the scale :data:`LEVEL`, from its pose of the first pass, which other
+        """Optimise every frame by itself, at the scale :data:`SCALE`, from its pose of the first pass, which other
         cameras have given; give each its residual. :meth:`settle` optimises at the finest scale."""
         for frames in _chunks(self.tracked):
-            coarse = Pyramid.of_all([self._pyramid(i, LEVEL + 1) for i in frames], LEVEL)
-            self.poses[frames] = self.tracker.settle(coarse, self.poses[frames], (LEVEL,)).states
+            coarse = Pyramid.of_all([self._pyramid(i, SCALE + 1) for i in frames], SCALE)
+            self.poses[frames] = self.tracker.settle(coarse, self.poses[frames], (SCALE,)).states
             seen = self._together(frames)
             label = self.tracker.coarse_grid.render(self.tracker.body, self.poses[frames]).label
             self.residual[frames] = self._residual(seen, label)
@@ -167,7 +167,7 @@ class SecondPass:
         def linearised(view_m: float) -> Equations:
             equations, share = Equations(len(poses), poses.shape[1], 0), self._share[frames]
             for rows in _chunks(np.arange(len(frames))):
-                prior = self.tracker.prior(near[rows], ANGLE_DEG)
+                prior = self.tracker.prior(near[rows], NEAR_DEG)
                 hessian, gradient = self.tracker.equations(self._together(frames[rows]), poses[rows], prior, view_m)
                 equations.hessian[rows] = share[rows, None, None] * hessian
                 equations.gradient[rows] = share[rows, None] * gradient
@@ -203,7 +203,7 @@ class SecondPass:
         frames, said = tracked[rows], np.add.reduceat(share, np.append(0, rows[:-1] + 1))
         choice = Choice(
             self.tracker,
-            lambda k: self._pyramid(frames[k], LEVEL + 1),
+            lambda k: self._pyramid(frames[k], SCALE + 1),
             lru_cache(self._kept)(lambda k: self._evidence(int(frames[k]))),
             frames,
             np.diff(rows) == np.diff(frames),
