@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -78,6 +79,17 @@ class Scene:
 @pytest.fixture(scope="module")
 def scene(tiny: Path) -> Scene:
     return Scene(tiny)
+
+
+@pytest.mark.parametrize("times", [0.95, 1.05, 1.2])
+def test_a_height_that_the_silhouettes_contradict_is_refused(scene: Scene, times: float) -> None:
+    assert scene.capture.subject_height_m is not None
+    tracker, subject = scene._tracker(), Subject(times * scene.capture.subject_height_m)
+    monitor = CameraMonitor(tracker, scene.setup, subject)
+    tracker.start(monitor.start(scene.frames[: tracker.opening_frames]), subject)
+    contradicted = times > 1.1
+    with pytest.raises(CaptureError, match="silhouettes fit a person of") if contradicted else nullcontext():
+        monitor.check_body()
 
 
 def moved(camera: int, frames: range, by: int = 30) -> Spoil:

@@ -9,7 +9,8 @@ A camera is left out of a frame if
 - the tracker finds nothing of the person in its mask; or
 - only one of the others shows anybody, so that there is no depth (:func:`~tk.trackers.protocol.usable`).
 
-No camera is left out for good: in each frame it is weighed again.
+No camera is left out for good. One that is wrong is weighed again in each frame in which it shows the person, if the
+images of three cameras can be used, and the tracker has residuals.
 
 Only contour trackers can go without a camera: a visual hull without one of its masks is empty.
 """
@@ -192,7 +193,7 @@ class CameraMonitor(Stateful[MonitorState]):
         return [without_cameras(f, out | b) for f, b in zip(frames, bad, strict=True)]
 
     def check_body(self) -> None:
-        """Refuse a body of an impossible size, or of another size than given, after the tracker's start.
+        """After the tracker's start, refuse a fitted body of an impossible size, or of another height than given.
 
         Raises:
             CaptureError: with the size and its likely causes.
@@ -200,7 +201,7 @@ class CameraMonitor(Stateful[MonitorState]):
         dimensions = self.tracker.body.dimensions
         if self._subject.height_m is None:
             check_stature(dimensions.stature)
-        else:
+        elif self._subject.body is None:
             check_height(dimensions.barefoot, self._subject.height_m)
 
     def step(self, frame: Frame) -> tuple[Estimate, Frame]:
