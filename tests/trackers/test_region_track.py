@@ -83,7 +83,9 @@ def test_the_second_pass_replaces_poses(tiny: Path, causal: Path, refined: Path)
     for name in ("frames", "time", "status"):
         np.testing.assert_array_equal(getattr(second, name), getattr(first, name), err_msg=name)
     assert first.residual is not None and second.residual is not None
-    assert second.residual.mean() < 1.03 * first.residual.mean()
+    # poses that the motion couples may explain single masks less well, but are nearer to the truth
+    assert second.residual.mean() < 1.1 * first.residual.mean()
+    assert mean_error(second, tiny) < mean_error(first, tiny)
     assert np.abs(second.pose - first.pose).max() > 1e-3
     # the settings are without a body fit
     np.testing.assert_array_equal(second.model["parts/shape"], first.model["parts/shape"])

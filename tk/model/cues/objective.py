@@ -70,6 +70,7 @@ class BodyObjective:
         coverage_weight: weight of the coverage term beside the surface term's 1; 0 leaves it out, as in the paper.
         contours: the edge term; None without it.
         scale: factor of all numbers of points in the optimisation (section 7.3).
+        dtype: precision of the kernel.
     """
 
     def __init__(
@@ -78,6 +79,7 @@ class BodyObjective:
         coverage_weight: float,
         contours: ContourTerm | None = None,
         scale: int = 1,
+        dtype: type = np.float32,
     ) -> None:
         self.body, self.contours, self.scale = body, contours, scale
         self.settings = ObjectiveParameters(
@@ -97,6 +99,7 @@ class BodyObjective:
             piece_part=self.piece_chain + 1,
             piece_patches=piece_patches(body),
             cameras=None if contours is None else contours.cameras,
+            dtype=dtype,
         )
         chain = CHAIN_OF_SEGMENT[body.segment]
         # the torso's samples, then each chain's
