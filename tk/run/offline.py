@@ -15,6 +15,7 @@ from tk.io.results.data import Result, UsedCameras
 from tk.io.results.revision import Revision
 from tk.io.results.status import Status
 from tk.model.body.cone_body import ConeBody
+from tk.model.body.plausibility import height_contradiction
 from tk.model.cameras.bundle import TrackedPerson
 from tk.model.cameras.camera import Rig
 from tk.model.cues import landmarks
@@ -200,6 +201,11 @@ class _Finisher:
             sigma = np.where(np.isnan(draft.current("evidence/sigma")), np.nan, precise)
             draft.columns |= {"pose": poses, "residual": residual, "evidence/sigma": sigma}
             draft.refined = True
+            if subject.body is None and subject.height_m is not None:
+                reason = height_contradiction(tracker.body.dimensions.barefoot, subject.height_m)
+                if reason:  # the opening has shown less of it
+                    self.note(f"{reason}: all frames are suspect")
+                    draft.unclear = ~draft.lost
 
     def _with_true_heading(self, draft: Draft) -> RegionTracker:
         """If the opposite heading is not improbable, by all frames, track the person again with it and its body; keep

@@ -7,7 +7,7 @@ A camera is left out of a frame if
 - in the opening frames its masks contradict those of the other cameras (:mod:`tk.model.masks.mask_agreement`);
 - its residual in this frame or the last ones is explained best by a fault of the camera (:mod:`tk.trackers.judgement`);
 - the tracker finds nothing of the person in its mask; or
-- only one of the others shows anybody, so that there is no depth (:func:`~tk.trackers.protocol.usable`).
+- no other camera in use shows the person, so that there is no depth (:func:`~tk.trackers.protocol.usable`).
 
 No camera is left out for good. One that is wrong is weighed again in each frame in which it shows the person, if the
 images of three cameras can be used, and the tracker has residuals.
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError
 from tk.kernels.mask_values import OTHERS, PERSON
 from tk.model.body.joint_sigma import CHANGING_M
-from tk.model.body.plausibility import check_extent, check_height, check_stature
+from tk.model.body.plausibility import check_extent, check_stature, height_contradiction
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import determine_depth
 from tk.model.cameras.landmark_agreement import evidence_for_cameras
@@ -201,8 +201,10 @@ class CameraMonitor(Stateful[MonitorState]):
         dimensions = self.tracker.body.dimensions
         if self._subject.height_m is None:
             check_stature(dimensions.stature)
-        elif self._subject.body is None:
-            check_height(dimensions.barefoot, self._subject.height_m)
+        elif self._subject.body is None and (
+            reason := height_contradiction(dimensions.barefoot, self._subject.height_m)
+        ):
+            raise CaptureError(reason)
 
     def step(self, frame: Frame) -> tuple[Estimate, Frame]:
         """Return the estimate for the next frame, and the observation without the excluded cameras."""

@@ -46,23 +46,22 @@ def check_extent(extent_m: float, height_m: float) -> None:
         )
 
 
-def check_height(fitted_m: float, height_m: float) -> None:
-    """Refuse a given height that the fitted body contradicts. The height is the mean of the body's prior, so the fit
-    leaves it only where many silhouettes demand it: cameras that all have too long a focal length show everybody
-    smaller, and each of them agrees with the others about a person between them.
+def height_contradiction(fitted_m: float, height_m: float) -> str:
+    """Return why a fitted body contradicts the given height, one line; empty if it does not.
+
+    The height is the mean of the body's prior, so the fit leaves it only where many silhouettes demand it: cameras that
+    all have too long a focal length show everybody smaller, and agree about a person between them.
 
     Args:
         fitted_m: height of the body without shoes, metres.
         height_m: the height in `capture.toml`.
-
-    Raises:
-        CaptureError: with the likely causes.
     """
-    if abs(math.log(fitted_m / height_m)) > _CONTRADICTED * STATURE_DEVIATION:
-        raise CaptureError(
-            f"the silhouettes fit a person of {fitted_m:.2f} m or {'less' if fitted_m < height_m else 'more'}, but "
-            f"[subject] height in capture.toml says {height_m:.2f} m: correct it, or {_CAUSES}"
-        )
+    if abs(math.log(fitted_m / height_m)) <= _CONTRADICTED * STATURE_DEVIATION:
+        return ""
+    return (
+        f"the silhouettes fit a person of {fitted_m:.2f} m or {'less' if fitted_m < height_m else 'more'}, but "
+        f"[subject] height in capture.toml says {height_m:.2f} m: correct it, or {_CAUSES}"
+    )
 
 
 def check_stature(stature_m: float) -> None:
