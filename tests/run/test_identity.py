@@ -23,6 +23,7 @@ from tk.people.identity import (
     Contact,
     Contacts,
     doubtful,
+    judge_contacts,
     outcome_of,
     report,
     unmixed,
@@ -114,14 +115,30 @@ def test_frames_in_which_it_is_unclear_who_is_who_are_doubtful(people: tuple[Res
     assert (people[1].status[~found] != Status.SUSPECT).all()
 
 
-def test_masks_are_exchanged_too(tmp_path: Path) -> None:
+def test_masks_are_exchanged_in_the_same_frames(people: tuple[Result, ...], tmp_path: Path) -> None:
     stores = [MaskStore(tmp_path / str(n)) for n in (0, 1)]
-    for frame in range(4):
+    for frame in people[0].frames.tolist():
         for n, store in enumerate(stores):
             store.put(frame, np.full((2, 3, 4), 255 * n, np.uint8))
-    contact = Contact((0, 1), 1, 2, 1, AT, outcome=EXCHANGED)
+    contact = Contact((0, 1), 2, 6, 3, AT, outcome=EXCHANGED)  # the second person is absent in frame 3
     for _ in range(2):  # an interrupted run is finished again: the stores stay as they are
-        mine, others = (unmixed_masks(n, [contact], dict(enumerate(stores)), np.arange(4)) for n in (0, 1))
-        assert [int(mine.get(frame).max()) for frame in range(4)] == [0, 255, 255, 0]
-        assert [int(others.get(frame).max()) for frame in range(4)] == [255, 0, 0, 255]
-    assert unmixed_masks(0, [], dict(enumerate(stores)), np.arange(4)) is stores[0]
+        mine, others = (unmixed_masks(n, [contact], dict(enumerate(stores)), people) for n in (0, 1))
+        assert [int(mine.get(frame).max()) for frame in range(2, 8)] == [0, 0, 255, 255, 255, 0]
+        assert [int(others.get(frame).max()) for frame in range(2, 8)] == [255, 255, 0, 0, 0, 255]
+    assert unmixed_masks(0, [], dict(enumerate(stores)), people) is stores[0]
+
+
+def test_contact_with_somebody_who_leaves_is_over_and_no_other_person_continues_it() -> None:
+    contacts = Contacts()
+    meet(contacts, [2.0, 0.4, 0.3])
+    contacts.leave(1)
+    (left,) = contacts.all
+    assert (left.first, left.last, left.outcome, left.learned) == (11, 12, UNCLEAR, ())
+    assert contacts.update(900, {0: np.zeros(3), 1: np.ones(3) * 3}, {0: LEARNED, 1: LEARNED}) == []
+    assert left.last == 12
+
+
+def test_nobody_tracked_is_in_no_contact() -> None:
+    contacts = Contacts()
+    judge_contacts(contacts, [], {})
+    assert not contacts.all

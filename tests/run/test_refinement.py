@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -281,34 +280,36 @@ def test_frame_that_is_judged_again_has_the_sigma_of_the_first_pass() -> None:
     assert (again.columns["status"] == Status.SUSPECT).all()
 
 
-def test_person_who_is_tracked_again_by_another_tracker_is_judged_as_in_the_first_pass(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    rig, zeros = ring_of_cameras(4, 8, 6), np.zeros((6, 8), np.uint8)
+def test_person_who_is_tracked_again_by_another_tracker_is_judged_as_in_the_first_pass() -> None:
+    rig, zeros, masks = ring_of_cameras(4, 8, 6), np.zeros((4, 6, 8), np.uint8), MaskStore()
+    for frame in range(6):
+        masks.put(frame, zeros)
 
-    class Observed:
-        def frames(self, begin: int, stop: int) -> Iterator[tuple[Frame, dict[str, float]]]:
-            return ((Frame(i, np.zeros((4, 6, 8, 3), np.uint8), np.stack(4 * [zeros])), {}) for i in range(begin, stop))
+    class Recorded:
+        def frames(self, begin: int, stop: int) -> Any:
+            images = np.zeros((4, 6, 8, 3), np.uint8)
+            return nullcontext(SimpleNamespace(index=i, halved=images, time=0.0) for i in range(begin, stop))
 
     class Jumping:
-        tracks_among_others, image_step = False, 1
+        tracks_among_others, image_step, has_second_pass = False, 1, True
 
         def step(self, frame: Frame) -> Estimate:
             at = np.full((15, 3), 9.0 if frame.index == 3 else 0.0)
             whole, none = np.full((4, 2), 0.02), np.zeros(1, np.int32)
             return Estimate(np.zeros(5), at, Status.TRACKED, 0.0, none, {}, deviation=np.full(15, 0.01), residual=whole)
 
-    monkeypatch.setattr(finish, "open_observations", lambda *_: nullcontext(Observed()))
     draft, _ = judged(6 * [0.05])
     given = {"pose": np.zeros((6, 5)), "objective": np.zeros(6), "evidence/camera": np.zeros((6, 4), np.uint8)}
-    result: Any = SimpleNamespace(**{**vars(draft.result), "status": np.zeros(6, np.uint8)})
-    draft = replace(draft, result=result, columns=draft.columns | given)
-    task: Any = SimpleNamespace(settings=Settings(), setup=SimpleNamespace(rig=rig, fps=15.0))
-    finisher = finish._Finisher(task, True, print, lambda _: None, rig)
+    status = np.array([0, 0, 0, 0, 0, Status.ABSENT], np.uint8)
+    result: Any = SimpleNamespace(**{**vars(draft.result), "status": status})
     tracker: Any = Jumping()
+    draft = replace(draft, tracker=tracker, masks=masks, result=result, columns=draft.columns | given)
+    task: Any = SimpleNamespace(settings=Settings(), source=Recorded(), setup=SimpleNamespace(rig=rig, fps=15.0))
+    finisher = finish._Finisher(task, True, print, lambda _: None, rig)
     found = finisher._tracked_by(tracker, draft, np.zeros((6, 4), np.bool_))
     assert found.lost.tolist() == [False, False, False, True, False, False]
     assert found.columns["evidence/found"].tolist() == [0, 0, 0, Reason.JUMPS, 0, 0]
+    assert (found.columns["joints/position"][3] == 9.0).all()
 
 
 def test_cameras_from_opposite_sides_leave_sigma_unknown_and_are_named_as_the_cause() -> None:

@@ -149,6 +149,7 @@ def test_ctrl_c_before_the_first_frame_leaves_an_older_result(
         (["--seed", "8"], "seed: 0, not 8"),
         (["--voxels", "40"], "config.voxels: 32, not 40"),
         (["--store-hull"], "stored hull: no, not yes"),
+        (["--store-hull", "--frames", "0:1"], "stored hull: no, not yes"),  # nothing is left to do
     ],
 )
 def test_only_the_same_command_is_resumed(

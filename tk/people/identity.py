@@ -59,6 +59,11 @@ class Contact:
     outcome: int = OPEN
     learned: tuple[LearnedColors, ...] = field(default=(), repr=False)
 
+    @property
+    def without_comparison(self) -> int:
+        """The outcome if the colours of the two cannot be compared after the contact."""
+        return outcome_of(np.zeros((2, 2)), self.shorter_m)
+
 
 class Contacts:
     """The contacts of a run."""
@@ -99,6 +104,13 @@ class Contacts:
                         ended.append(contact)
         return ended
 
+    def leave(self, number: int) -> None:
+        """End the contacts of somebody who is no longer tracked: nobody can be compared, and somebody else may get the
+        number."""
+        for contact in self.all:
+            if contact.outcome == OPEN and number in contact.people:
+                contact.outcome, contact.learned = contact.without_comparison, ()
+
 
 def judge_contacts(contacts: Contacts, tracked: Sequence[Person], answers: Mapping[int, Answer]) -> None:
     """Compare people whose contact has ended with those before it; exchange their trackers if they were mixed up.
@@ -108,9 +120,9 @@ def judge_contacts(contacts: Contacts, tracked: Sequence[Person], answers: Mappi
         tracked: the people.
         answers: theirs for a frame, by number.
     """
-    here = {person.number: person for person in tracked if not person.lost}
-    if len(tracked) == 1:
+    if len(tracked) < 2:
         return
+    here = {person.number: person for person in tracked if not person.lost}
     pelvis = {n: answers[n].estimate.joints[JOINTS.index("pelvis")] for n in here}
     frame = next(iter(answers.values())).share.index
     for contact in contacts.update(frame, pelvis, {n: person.sharing.learned() for n, person in here.items()}):
@@ -153,11 +165,16 @@ def unmixed(people: Sequence[Result], contacts: Sequence[Contact]) -> tuple[Resu
         if contact.outcome != EXCHANGED:
             continue
         of_a, of_b = (found[n] for n in contact.people)
-        there = (of_a.status != Status.ABSENT) & (of_b.status != Status.ABSENT)
-        rows = np.flatnonzero(there & (of_a.frames >= contact.moment) & (of_a.frames <= contact.last))
+        rows = np.flatnonzero(_exchanged(contact, of_a, of_b))
         for n, mine, other in zip(contact.people, (of_a, of_b), (of_b, of_a), strict=True):
             found[n] = _with_rows(mine, other, rows)
     return tuple(found)
+
+
+def _exchanged(contact: Contact, of_a: Result, of_b: Result) -> NDArray[np.bool_]:
+    """Return (F,) the frames in which the two of a contact are exchanged: none in which one is absent."""
+    there = (of_a.status != Status.ABSENT) & (of_b.status != Status.ABSENT)
+    return np.asarray(there & (of_a.frames >= contact.moment) & (of_a.frames <= contact.last))
 
 
 def doubtful(person: Result, contacts: Sequence[Contact]) -> NDArray[np.bool_]:
@@ -183,19 +200,26 @@ def report(contacts: Sequence[Contact]) -> list[str]:
 
 
 def unmixed_masks(
-    person: int, contacts: Sequence[Contact], masks: MaskStores | Mapping[int, MaskStore], frames: NDArray[np.int64]
+    person: int, contacts: Sequence[Contact], masks: MaskStores | Mapping[int, MaskStore], people: Sequence[Result]
 ) -> MaskStore:
-    """Return a person's masks of frames (F,), those that :func:`unmixed` exchanges taken from the other person; the
-    stores stay as they are."""
-    mixed = [c for c in contacts if c.outcome == EXCHANGED]
-    if not any(person in contact.people for contact in mixed):
+    """Return a person's masks of all frames, those that :func:`unmixed` exchanges taken from the other person; the
+    stores stay as they are.
+
+    Args:
+        person: number of the person.
+        contacts: of the run.
+        masks: of each person.
+        people: as given to :func:`unmixed`.
+    """
+    mixed = [(c, _exchanged(c, *(people[n] for n in c.people))) for c in contacts if c.outcome == EXCHANGED]
+    if not any(person in contact.people for contact, _ in mixed):
         return masks[person]
     result = MaskStore()
-    for frame in frames.tolist():
-        owner = {n: n for contact in mixed for n in contact.people}
-        for contact in mixed:
+    for row, frame in enumerate(people[person].frames.tolist()):
+        owner = {n: n for contact, _ in mixed for n in contact.people}
+        for contact, exchanged in mixed:
             a, b = contact.people
-            if contact.moment <= frame <= contact.last and frame in masks[a] and frame in masks[b]:
+            if exchanged[row]:
                 owner[a], owner[b] = owner[b], owner[a]
         if frame in masks[owner[person]]:
             result.put(frame, masks[owner[person]].get(frame), masks[owner[person]].colors(frame))

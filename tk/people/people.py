@@ -35,7 +35,7 @@ from tk.model.setup import Setup, Subject
 from tk.people.choose import chosen, in_order, matched, unknown_subject
 from tk.people.find import LocatedPerson, PeopleFinder
 from tk.people.hulls import shares_by_hulls
-from tk.people.identity import EXCHANGED, UNCLEAR, Contact, Contacts, judge_contacts
+from tk.people.identity import EXCHANGED, OPEN, UNCLEAR, Contact, Contacts, judge_contacts
 from tk.people.person import Answer, Person, PersonState, no_pose
 from tk.people.share import PixelOwners, assign
 from tk.settings import Settings
@@ -57,11 +57,14 @@ _SAME_COLORS = -1.1
 
 @dataclass(frozen=True)
 class PeopleState:
-    """The people who are tracked, the numbers of those who have had a tracker, and the contacts."""
+    """The people who are tracked, the numbers of those who have had a tracker, the contacts, and how many could not be
+    tracked since somebody was, and the frame from which on another may be."""
 
     tracked: list[PersonState]
     given: list[int]
     contacts: list[Contact]
+    refused: int = 0
+    admit_from: int = 0
 
 
 class People:
@@ -111,14 +114,21 @@ class People:
 
     @property
     def contacts(self) -> list[Contact]:
-        """The contacts of the people in the result. With somebody who is not in it, frames cannot be exchanged."""
+        """The contacts of the people in the result. One that has not ended is judged by the pelvises alone. With
+        somebody who is not in the result, frames cannot be exchanged."""
         numbers, found = {person.number for person in self.written}, []
         for contact in self._contacts.all:
-            if numbers.issuperset(contact.people):
-                found.append(contact)
-            elif not numbers.isdisjoint(contact.people):
-                found.append(replace(contact, outcome=UNCLEAR) if contact.outcome == EXCHANGED else contact)
+            outcome = contact.without_comparison if contact.outcome == OPEN else contact.outcome
+            if outcome == EXCHANGED and not numbers.issuperset(contact.people):
+                outcome = UNCLEAR
+            if not numbers.isdisjoint(contact.people):
+                found.append(replace(contact, outcome=outcome))
         return found
+
+    @property
+    def alone(self) -> bool:
+        """Whether nobody but the one person in the result has been tracked: all masks are this person's."""
+        return len(self._given or ()) == len(self.written) == 1
 
     @property
     def has_segments(self) -> bool:
@@ -334,6 +344,9 @@ class People:
                 person.absent = False  # no newcomer is written: who appears may be this person, and the tracker looks
         if due and not numbered:  # who is not written, and lost, comes back as a newcomer
             self._tracked = [p for p in self._tracked if p.written or not p.lost]
+            for person in lost:
+                if not person.written:
+                    self._contacts.leave(person.number)
         searching = any(p.lost and not p.absent for p in self._tracked)
         if searching or len(self._unknown) < INFORMATIVE_FRAMES or frame.index < self._admit_from:
             return {}
@@ -436,10 +449,11 @@ class People:
             )
             for person in self._tracked
         ]
-        return PeopleState(tracked, sorted(self._given or ()), self._contacts.all)
+        return PeopleState(tracked, sorted(self._given or ()), self._contacts.all, self._refused, self._admit_from)
 
     def resume(self, models: Sequence[Mapping[str, Any]], state: PeopleState) -> None:
-        """Continue a run. Earlier frames are not stored, so a person who has just entered may be tracked later.
+        """Continue a run. Earlier frames are not stored, so a person who has just entered is tracked some frames
+        later.
 
         Args:
             models: bodies of the people in the result.
@@ -456,6 +470,7 @@ class People:
             person.state = stored.member
             self._tracked.append(person)
         self._given, self._contacts.all = set(state.given), state.contacts
+        self._refused, self._admit_from = state.refused, state.admit_from
 
 
 def _not_entered(number: int) -> str:

@@ -31,7 +31,7 @@ class Draft:
         unclear: (F,) frames that are suspect, whatever their residual is.
         columns: what differs from the file, by dataset.
         masks: of the frames; None without a second pass.
-        refined: whether the second pass has changed the body.
+        refined: whether the second pass has changed the poses.
     """
 
     person: Person
@@ -61,13 +61,14 @@ class Draft:
     def take(self, rows: NDArray[np.int64], estimates: Sequence[Estimate]) -> None:
         """Take other estimates for some frames; the first frame stays "initialised"."""
         evidence = ("reason", "found", "origin", "sigma", "camera")
-        datasets = ("pose", "residual", "objective", *(f"evidence/{name}" for name in evidence))
+        datasets = ("pose", "joints/position", "residual", "objective", *(f"evidence/{name}" for name in evidence))
         columns = {dataset: self.current(dataset).copy() for dataset in datasets}
         if (modes := self.current("evidence/modes")) is not None:
             columns["evidence/modes"] = modes = modes.copy()
             modes[rows] = np.nan
         for row, e in zip(rows, estimates, strict=True):
-            columns["pose"][row], columns["objective"][row] = e.pose, e.objective
+            columns["pose"][row], columns["joints/position"][row] = e.pose, e.joints
+            columns["objective"][row] = e.objective
             columns["evidence/sigma"][row], columns["residual"][row] = e.deviation, e.residual
             columns["evidence/reason"][row], columns["evidence/found"][row] = e.reason, e.found
             if e.modes is not None and modes is not None:

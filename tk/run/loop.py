@@ -118,10 +118,11 @@ class Loop:
         """
         plan, output = self.plan, self.output
         done = output.done if output else 0
+        if output and done:
+            output.check()
         if plan.stop is not None and plan.begin + done >= plan.stop:
             return
         if output and done:
-            output.check()
             output.check_open()
             self._restore(output)
             yield from self._step_through(plan.observations.frames(plan.begin + done, plan.stop))
@@ -186,7 +187,6 @@ class Loop:
         results = zip(output.writer.models, read_result(path).people, strict=True)
         if all(r.smoothed is not None and (one_pass or REFINED in model) for model, r in results):
             return False
-        output.check()
         self._restore(output)
         return True
 
@@ -272,16 +272,15 @@ class Loop:
 
     def _kept(self, answer: Answer) -> tuple[NDArray[np.uint8], NDArray[np.uint16] | None]:
         """Return the cleaned masks (C, H, W) of a frame, also of cameras that disagree: they may be refined; and what
-        the masks show, (C, h, w), if it is known in all cameras."""
+        the masks show, (C, h, w), in the cameras that were used."""
         tracker, estimate = two_pass(self.plan.tracker), answer.estimate
         assert tracker is not None
         taken = tracker.cleaned(answer.used.masks) if estimate.masks is None else estimate.masks
         out = shows_person(answer.share.masks) & ~shows_person(answer.used.masks)
-        if not out.any():
-            return taken, estimate.colors
-        taken = taken.copy()
-        taken[out] = tracker.cleaned(answer.share.masks[out])
-        return taken, None
+        if out.any():
+            taken = taken.copy()
+            taken[out] = tracker.cleaned(answer.share.masks[out])
+        return taken, estimate.colors
 
     def _state(self, output: Output) -> Mapping[str, Value]:
         origin = {_ORIGIN + name: value for name, value in output.origin.items()}

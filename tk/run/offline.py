@@ -28,7 +28,7 @@ from tk.run.delays import COMPARED, retimed, retimed_measured
 from tk.run.draft import Draft, held, without_absent
 from tk.run.prefetch import open_observations
 from tk.run.refinement import compare_cameras, refine_if_inconsistent
-from tk.run.second_run import Run, explains_better, track_again, track_back
+from tk.run.second_run import Run, explains_better, shown_again, track_again, track_back
 from tk.run.task import Task
 from tk.trackers.headings import both_headings, trajectory_cost, turned_pose
 from tk.trackers.hypotheses import DROPPED
@@ -36,6 +36,7 @@ from tk.trackers.judgement import FrameEvidence, FrameJudge, depth_known, judge_
 from tk.trackers.protocol import Estimate, two_pass, usable
 from tk.trackers.reason import Reason, known_sigma, report_frames, status_of
 from tk.trackers.region import RegionTracker
+from tk.trackers.residual import mean_error
 
 _LOG = logging.getLogger(__name__)
 Float = NDArray[np.float64]
@@ -87,14 +88,17 @@ def finish(
     drafts = []
     for person in written:
         result = results[person.number]
-        draft = Draft(person, result, person.tracker, ~result.has_pose, result.has_pose & doubtful(result, contacts))
+        draft = Draft(person, result, person.tracker, ~result.has_pose, doubtful(result, contacts))
         if result is not kept[person.number]:
             columns = {dataset: getattr(result, name) for dataset, name in COLUMNS.items()}
             draft.columns = {dataset: values for dataset, values in columns.items() if values is not None}
         if masks is not None:
-            draft.masks = unmixed_masks(person.number, contacts, masks, result.frames)
+            draft.masks = unmixed_masks(person.number, contacts, masks, kept)
         drafts.append(draft)
-    revisions, finisher = {}, _Finisher(task, len(written) == 1, note, within, task.setup.rig, film_again)
+    revisions, finisher = (
+        {},
+        _Finisher(task, people.alone, note, within, task.setup.rig, film_again, several=len(written) > 1),
+    )
     if people.has_segments:
         finisher.second_pass([draft for draft in drafts if finisher.has_masks(draft)])
     for draft in drafts:
@@ -102,7 +106,8 @@ def finish(
         if people.has_segments:
             revisions[number] = without_absent(finisher.revision(draft), draft.result.status == Status.ABSENT)
             reasons = draft.current("evidence/reason")
-        _report(draft.result.frames, reasons, note, number, finisher.alone)
+        if reasons is not None:
+            report_frames(draft.result.frames, reasons, finisher.about(draft))
     status = [
         np.asarray(revisions[person.person].columns["status"]) if person.person in revisions else person.status
         for person in found
@@ -115,11 +120,12 @@ class _Finisher:
     """Finishes people: cameras are compared and refined about all of them, then each has a second pass."""
 
     task: Task
-    alone: bool  # whether the result has one person
+    alone: bool  # whether nobody but the person in the result has been tracked
     note: Note
     within: Callable[[float], None]
     rig: Rig  # as used
     film_again: Callable[[Sequence[float] | None], None] = lambda _: None
+    several: bool = False  # whether the result has several people
     late: NDArray[np.int64] = field(init=False)  # (C,) whole frames by which each video is late, as found
     offset_frames: Float = field(init=False)  # (C,) the same, not rounded
 
@@ -131,6 +137,10 @@ class _Finisher:
         """The cameras as used, and their delays."""
         offsets = np.array(self.task.source.time_offset_s) + self.offset_frames / self.task.setup.fps
         return UsedCameras(self.rig, offsets)
+
+    def about(self, draft: Draft) -> Note:
+        """Return what receives lines about a draft's person, who is named if the result has several."""
+        return named(draft.person.number, self.note) if self.several else self.note
 
     def revision(self, draft: Draft) -> Revision:
         """Return what all frames of a person give: status and sigma; segments, feet and angles; the smoothed copy."""
@@ -158,10 +168,7 @@ class _Finisher:
                 masks.put(frame, np.zeros((len(self.rig), *self.rig.frame_shape), np.uint8))
         missing = [frame for frame in result.frames[~absent].tolist() if frame not in masks]
         if missing and not self.alone:
-            self.note(
-                f"person {draft.person.number}: the second pass is omitted, because an earlier run kept no masks of "
-                "each person"
-            )
+            self.about(draft)("the second pass is omitted, because an earlier run kept no masks of each person")
             return False
         if missing:
             with open_observations(self.task, lambda _: None, tracker.image_step) as observations:
@@ -176,7 +183,7 @@ class _Finisher:
         """
         if not drafts:
             return
-        for draft in drafts if self.alone else ():
+        for draft in drafts:
             if draft.person.subject.init is None:  # a given pose shows where the front is
                 draft.tracker = self._with_true_heading(draft)
         self._refine_cameras(drafts)
@@ -193,19 +200,20 @@ class _Finisher:
                 subject.height_m,
                 self._measured(draft, self.late),
                 draft.current("evidence/modes"),
-                masks.color_sequence(draft.result.frames),
+                masks.color_sequence(draft.result.frames, self._has_colors(draft)),
                 keep_body=subject.body is not None,
                 report=self.within,
             )
             # a joint that the first pass knew nothing about stays unknown
             sigma = np.where(np.isnan(draft.current("evidence/sigma")), np.nan, precise)
-            draft.columns |= {"pose": poses, "residual": residual, "evidence/sigma": sigma}
+            error = np.where(draft.lost, draft.current("objective"), mean_error(residual))
+            draft.columns |= {"pose": poses, "residual": residual, "evidence/sigma": sigma, "objective": error}
             draft.refined = True
             if subject.body is None and subject.height_m is not None:
                 reason = height_contradiction(tracker.body.dimensions.barefoot, subject.height_m)
                 if reason:  # the opening has shown less of it
-                    self.note(f"{reason}: all frames are suspect")
-                    draft.unclear = ~draft.lost
+                    self.about(draft)(f"{reason}: all frames are suspect")
+                    draft.unclear = np.ones_like(draft.lost)
 
     def _with_true_heading(self, draft: Draft) -> RegionTracker:
         """If the opposite heading is not improbable, by all frames, track the person again with it and its body; keep
@@ -259,15 +267,15 @@ class _Finisher:
         if cost(opposite, found, again) >= least or np.median(np.cos(found[both, yaw] - poses[both, yaw])) > 0:
             return tracker  # or it may have found the other heading by itself
         draft.lost, draft.columns = again.lost, again.columns
-        self.note("the person faces the other way than the first frames seemed to show: tracked again")
+        self.about(draft)("the person faces the other way than the first frames seemed to show: tracked again")
         return opposite
 
     def _find_lost(self, draft: Draft) -> None:
         """Find the person in lost frames from the frames after them."""
-        frames, settings = draft.result.frames, self.task.settings.region
+        frames = draft.result.frames
         present = np.flatnonzero(draft.result.status != Status.ABSENT)
         run = Run.of(draft.tracker_and_masks, frames, draft, present)
-        found = track_back(run, self._landmarks(draft, self.late), self.task.setup.fps, settings.false_alarm)
+        found = track_back(run, self._landmarks(draft, self.late))
         if found:
             rows = np.flatnonzero(np.isin(frames, list(found)))
             draft.take(rows, [found[int(frame)] for frame in frames[rows]])
@@ -275,18 +283,16 @@ class _Finisher:
     def _tracked_by(self, tracker: RegionTracker, draft: Draft, unused: NDArray[np.bool_]) -> Draft:
         """Track the frames of a draft by a tracker that has been started, without the cameras (F, C) that are unused;
         return the draft of it."""
-        present = np.flatnonzero(draft.result.status != Status.ABSENT)
-        rows = dict(zip(draft.result.frames[present].tolist(), present.tolist(), strict=True))
-        judge = FrameJudge(
-            tracker, len(self.task.setup.rig), self.task.setup.fps, self.task.settings.region.false_alarm
-        )
+        masks, present = draft.tracker_and_masks[1], np.flatnonzero(draft.result.status != Status.ABSENT)
+        numbers, source, cameras = draft.result.frames[present], self.task.source, unused.shape[1]
+        judge = FrameJudge(tracker, cameras, self.task.setup.fps, self.task.settings.region.false_alarm)
         found: list[Estimate] = []
-        with open_observations(self.task, lambda _: None, tracker.image_step) as observations:
-            for frame, _ in observations.frames(min(rows), max(rows) + 1):
-                if frame.index in rows:
-                    estimate = tracker.step(usable(frame, unused[rows[frame.index]]))
-                    found.append(judge.judge(frame.index, estimate).light)
-                    self.within(len(found) / len(rows))
+        with source.frames(int(numbers[0]), int(numbers[-1]) + 1) as images:
+            frames = shown_again(images, numbers, masks, self._landmarks(draft, self.late))
+            for frame, row in zip(frames, present.tolist(), strict=True):
+                estimate = tracker.step(usable(frame, unused[row]))
+                found.append(judge.judge(frame.index, estimate).light)
+                self.within(len(found) / len(present))
         again = draft.copy()
         again.take(present, found)
         return again
@@ -304,7 +310,7 @@ class _Finisher:
         if apart := "" if agreement is None else agreement.size_contradiction:
             self.note(f"{apart}: all frames are suspect")
             for draft in drafts:
-                draft.unclear = ~draft.lost
+                draft.unclear = np.ones_like(draft.lost)
         if agreement is None or apart or not self.task.settings.refine:
             return
         refined = refine_if_inconsistent(people, world.rig, agreement)
@@ -323,7 +329,7 @@ class _Finisher:
             draft.tracker, draft.masks = changed.tracker, changed.masks
             draft.lost, draft.columns = changed.lost, changed.columns
             for line in lines:
-                self.note(line if self.alone else f"person {draft.person.number}: {line}")
+                self.about(draft)(line)
 
     def _seen(self, draft: Draft) -> TrackedPerson:
         """Return what the cameras are compared by."""
@@ -340,6 +346,13 @@ class _Finisher:
             return {}
         found = self.task.setup.rig.reduced_pixels(np.concatenate([found, depth[..., None]], axis=-1))
         return {landmarks.NAME: retimed_measured(found, draft.result.frames, late)}
+
+    def _has_colors(self, draft: Draft) -> NDArray[np.bool_]:
+        """Return (F,) the frames in which no camera is used whose colours the first pass left out."""
+        then, now = draft.result.residual, draft.current("residual")
+        assert then is not None
+        seen = retimed_measured(then[..., :1, None], draft.result.frames, self.late)[..., 0, 0]
+        return np.asarray(~(np.isfinite(now[..., 0]) & np.isnan(seen)).any(axis=1))
 
     def _landmarks(self, draft: Draft, late: NDArray[np.int64]) -> dict[int, Float]:
         """Return the landmarks (C, L, 4) of :meth:`_measured`, by frame, of frames that have any."""
@@ -402,10 +415,9 @@ class _Finisher:
             draft.columns["joints/sigma"] = known_sigma(sigma, reasons)
 
 
-def _report(frames: NDArray[np.int64], reasons: NDArray[np.uint8] | None, note: Note, person: int, alone: bool) -> None:
-    """Report the frames (F,) of each reason (F,) of a person."""
-    if reasons is not None:
-        report_frames(frames, reasons, note if alone else lambda line: note(f"person {person}: {line}"))
+def named(person: int, note: Note) -> Note:
+    """Return what receives lines about a person, by number, who is named in them."""
+    return lambda line: note(f"person {person}: {line}")
 
 
 def _columns(body: ConeBody, poses: NDArray[np.float64], landmarks: bool) -> dict[str, NDArray[np.floating]]:

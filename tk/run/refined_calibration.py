@@ -47,8 +47,8 @@ def refine_capture(
     """
     check_output(output, CALIBRATION, force, [result], capture.path, CalibrationError)
     found = read_result(result)
-    tracked = body_and_poses(found)
-    if tracked is None:
+    tracked = [(person, known) for person in found.people if (known := body_and_poses(person)) is not None]
+    if not tracked:
         raise ConfigError(f"{result}: has no body with contours; track with the method region")
     if not len(found.frames) or found.frames.max() >= capture.frame_count or found.meta.up != capture.up:
         raise ResultError(f"{result}: is not a result of {capture.path}")
@@ -62,9 +62,11 @@ def refine_capture(
     with open_observations(Task.of(source, config), note, image_step=0) as observations:
         for observation, _ in observations.frames(int(found.frames.min()), int(found.frames.max()) + 1):
             store.put(observation.index, observation.masks)
-    body, poses = tracked[0].standing("z"), world.poses_in(tracked[1])
-    person = TrackedPerson(body, lru_cache(16)(store.get), found.frames, poses, found.has_pose)
-    done = refine_rig([person], world.rig, how)
+    masks, people = lru_cache(16)(store.get), list[TrackedPerson]()
+    for person, (body, poses) in tracked:
+        inside = world.poses_in(poses)
+        people.append(TrackedPerson(body.standing("z"), masks, person.frames, inside, person.has_pose))
+    done = refine_rig(people, world.rig, how)
     if done is None:
         raise CaptureError(
             f"{result}: has too few consecutive tracked frames to refine {capture.path}; "

@@ -10,7 +10,7 @@ lead to the right one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import chain, islice, takewhile
 from typing import Any, Protocol
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
+from tk.io.captures.frames import FrameSet
 from tk.io.captures.mask_store import MaskStore
 from tk.io.captures.source import Source
 from tk.kernels.mask_values import OTHERS, PERSON
@@ -149,17 +150,7 @@ def track_again(
     monitor = CameraMonitor(tracker, replace(setup, rig=tracker.rig), subject)
     found: dict[int, Estimate] = {}
     with source.frames(begin, stop) as images:
-        frames = (
-            Frame(
-                frame.index,
-                frame.halved,
-                masks.get(frame.index),
-                time=frame.time,
-                landmarks=landmarks[frame.index][None] if frame.index in landmarks else None,
-            )
-            for frame in images
-            if frame.index in masks
-        )
+        frames = shown_again(images, first.frames, masks, landmarks)
         opening = list(islice(frames, tracker.opening_frames))
         try:
             seen = monitor.start(opening)
@@ -178,7 +169,26 @@ def track_again(
     return found, monitor
 
 
-def track_back(run: Run, landmarks: Mapping[int, Float], fps: float, false_alarm: float) -> dict[int, Estimate]:
+def shown_again(
+    images: Iterable[FrameSet], present: NDArray[np.int64], masks: MaskStore, landmarks: Mapping[int, Float]
+) -> Iterator[Frame]:
+    """Yield what images show again of a person, in the frames in which the person is present, by their numbers: the
+    masks are not made again.
+
+    Args:
+        images: in order.
+        present: (F,) numbers of frames.
+        masks: of these frames at least.
+        landmarks: as for :func:`track_again`.
+    """
+    numbers = set(present.tolist())
+    for frame in images:
+        if (n := frame.index) in numbers:
+            marked = landmarks[n][None] if n in landmarks else None
+            yield Frame(n, frame.halved, masks.get(n), time=frame.time, landmarks=marked)
+
+
+def track_back(run: Run, landmarks: Mapping[int, Float]) -> dict[int, Estimate]:
     """Track each stretch of lost frames backwards, from the frames after it on, to the first frame in which the person
     is not found; return the estimates of those in which the person is found, by frame.
 
@@ -188,21 +198,18 @@ def track_back(run: Run, landmarks: Mapping[int, Float], fps: float, false_alarm
     Args:
         run: the run; its frames are in order.
         landmarks: (C, L, 4) of the person by frame, where there are any.
-        fps: frames per second.
-        false_alarm: as for :func:`~tk.trackers.judgement.judge_frames`.
     """
     found: dict[int, Estimate] = {}
-    if not run.lost.any():
+    lost = run.lost
+    if not lost.any():
         return found
-    tracker = run.tracker.with_cameras(run.tracker.world.rig_out(run.tracker.world.rig))
-    lost, steps = run.lost, np.diff(run.frames)
-    step = int(np.median(steps)) if len(steps) else 1
-    for rows in np.split(np.arange(len(lost)), np.flatnonzero(steps > step) + 1):
+    tracker = run.tracker.with_cameras(run.tracker.rig)
+    for rows in np.split(np.arange(len(lost)), np.flatnonzero(np.diff(run.frames) > 1) + 1):
         for last in np.flatnonzero(lost[rows[:-1]] & ~lost[rows[1:]]):
             after = list(takewhile(lambda row: not lost[row], rows[last + 1 : last + 1 + RECENT]))
             stretch = list(takewhile(lambda row: lost[row], rows[last::-1]))
             tracker.start_at(run.poses[after[-1]])
-            judge = FrameJudge(tracker, run.residual.shape[1], fps, false_alarm)
+            judge = FrameJudge(tracker, run.residual.shape[1], tracker.fps, tracker.region_settings.false_alarm)
             for row in chain(reversed(after), stretch):
                 if (number := int(run.frames[row])) not in run.masks:
                     break

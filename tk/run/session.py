@@ -21,7 +21,7 @@ from tk.io.results.revision import revise_people
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
 from tk.run.loop import Loop, Output
-from tk.run.offline import finish
+from tk.run.offline import finish, named
 from tk.run.plan import open_plan, recording_task
 from tk.run.reporter import Reporter
 from tk.run.task import RecordingOptions, Task
@@ -187,5 +187,6 @@ def estimates(task: Task, note: Callable[[str], None] = lambda _: None) -> Itera
             yield estimate
         for line in loop.people.report():
             note(line)
-        for _, reasons in sorted(found.items()):
-            report_frames(list(reasons), list(reasons.values()), note)
+        for number, reasons in sorted(found.items()):
+            about = note if len(loop.people.written) == 1 else named(number, note)
+            report_frames(list(reasons), list(reasons.values()), about)

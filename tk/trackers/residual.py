@@ -39,9 +39,17 @@ def displacements(residual: Float) -> Float:
     return np.asarray(2.0 * np.sqrt(np.minimum(missing, surplus) * surplus))
 
 
+def mean_error(residual: Float) -> Float:
+    """Return (...) E_S, the mean over the views that see anybody, of residuals (..., V, 2); NaN if none does."""
+    return _mean_of_seen(residual.sum(axis=-1))
+
+
 def displacement(residual: Float) -> Float:
     """Return (...) the mean of :func:`displacements` over the views that see anybody; NaN if none does."""
-    by_view = displacements(residual)
+    return _mean_of_seen(displacements(residual))
+
+
+def _mean_of_seen(by_view: Float) -> Float:
     seen = np.isfinite(by_view)
     total, count = np.where(seen, by_view, 0.0).sum(axis=-1), np.count_nonzero(seen, axis=-1)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)

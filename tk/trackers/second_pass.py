@@ -36,6 +36,7 @@ from tk.model.masks.silhouettes import Pyramid, Views
 from tk.model.motion.coupling import MotionTerm
 from tk.optim.trajectory import Equations
 from tk.trackers.alternatives import AT_ONCE, NEAR_DEG, SCALE, Choice, apart
+from tk.trackers.residual import mean_error
 
 if TYPE_CHECKING:
     from tk.trackers.region import RegionTracker
@@ -118,7 +119,7 @@ class SecondPass:
         """Fit the tracker's body to frames of the opening and to the best frames of all stretches."""
         tracker, tracked = self.tracker, self.tracked
         opening = tracked[: min(tracker.opening_frames, FIT_FRAMES) : 3]
-        error = np.nanmean(self.residual[tracked].sum(axis=2), axis=1)
+        error = np.nan_to_num(mean_error(self.residual[tracked]), nan=np.inf)
         chosen = np.union1d(opening, _lowest(tracked, error, FIT_FRAMES - len(opening)))
         stature = height_m or tracker.body.dimensions.barefoot
         deviation = STATURE_DEVIATION if height_m else FITTED_STATURE_DEVIATION

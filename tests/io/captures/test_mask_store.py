@@ -153,3 +153,19 @@ def test_masks_of_a_killed_run_are_read_up_to_the_damage(seed, tmp_path_factory)
     np.testing.assert_array_equal(MaskStore(path, resume=True).get(5), masks[5])
     MaskStore(path).put(0, masks[0])
     assert 5 not in MaskStore(path, resume=True), "without resume the file is overwritten"
+
+
+def test_masks_that_are_stored_again_show_nothing_of_the_earlier_ones(tmp_path):
+    store = MaskStore(tmp_path / "masks")
+    masks = np.zeros((1, 4, 6), np.uint8)
+    masks[0, 1, :4] = 255, 255, OTHERS, OTHERS
+    store.put(3, masks, np.ones((1, 2, 3), np.uint16))
+    later = np.where(masks == OTHERS, 0, masks).astype(np.uint8)
+    store.put(3, later)
+    for known in (store, MaskStore(tmp_path / "masks", resume=True)):
+        np.testing.assert_array_equal(known.get(3), later)
+        assert known.colors(3) is None
+    store.put(3, masks, np.ones((1, 2, 3), np.uint16))
+    for known in (store, MaskStore(tmp_path / "masks", resume=True)):
+        np.testing.assert_array_equal(known.get(3), masks)
+        assert known.colors(3) is not None

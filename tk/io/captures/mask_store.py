@@ -85,8 +85,19 @@ class MaskStore:
             known = kind in (_PERSON, _OTHERS, _COLORS) and self._shapes.get(kind, tuple(shape)) == tuple(shape)
             if not (known and 0 < size <= whole - begin and min(shape) > 0 and _is_whole(file.read(size), kind, shape)):
                 break
-            self._shapes[kind], self._places[index, kind], end = tuple(shape), (begin, size), begin + size
+            self._shapes[kind], end = tuple(shape), begin + size
+            self._place(index, kind, (begin, size))
         file.truncate(end)
+
+    def _place(self, index: int, kind: int, place: tuple[int, int]) -> None:
+        """Note where a record is. A frame's masks are its last record: those before them that are older than the masks
+        of an earlier time belong to that time."""
+        before, _ = self._places.get((index, _PERSON), (-1, 0))
+        if kind == _PERSON:
+            for other in (_OTHERS, _COLORS):
+                if self._places.get((index, other), (before, 0))[0] < before:
+                    del self._places[index, other]
+        self._places[index, kind] = place
 
     def __contains__(self, index: int) -> bool:
         return (index, _PERSON) in self._places
@@ -120,7 +131,7 @@ class MaskStore:
             file.flush()
         except OSError as error:
             raise self._no_room(error) from None
-        self._places[index, kind] = (place, len(packed))
+        self._place(index, kind, (place, len(packed)))
 
     def get(self, index: int) -> Masks:
         """Return the masks (C, H, W) of a stored frame."""
@@ -185,9 +196,11 @@ class MaskStore:
 
         return Frames(get, range(len(numbers)))
 
-    def color_sequence(self, indices: NDArray[np.int64]) -> Frames[Colors | None]:
-        """Return what the masks of these frames show, as :meth:`colors`, unpacked on access."""
-        return Frames(self.colors, indices.tolist())
+    def color_sequence(self, indices: NDArray[np.int64], whole: NDArray[np.bool_]) -> Frames[Colors | None]:
+        """Return what the masks of these frames (F,) show, as :meth:`colors`, unpacked on access; None unless ``whole``
+        (F,)."""
+        numbers = indices.tolist()
+        return Frames(lambda row: self.colors(numbers[row]) if whole[row] else None, range(len(numbers)))
 
 
 def _is_whole(packed: bytes, kind: int, shape: Sequence[int]) -> bool:
