@@ -19,7 +19,7 @@ DERIVATIVE = 1e-5
 def _project_kernel(real):
     @ti.kernel
     def kernel(
-        camera: ti.types.ndarray(dtype=real, ndim=2),  # (V, 26)
+        camera: ti.types.ndarray(dtype=real, ndim=2),  # (V, 27)
         view: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,)
         world: ti.types.ndarray(dtype=real, ndim=2),  # (N, 3)
         pixels: ti.types.ndarray(dtype=real, ndim=2),  # (N, 2) out
@@ -44,7 +44,7 @@ def project_points(
     """Project points, each by a camera of its own.
 
     Args:
-        cameras: (V, 26) rows of :func:`pack_cameras`.
+        cameras: (V, 27) rows of :func:`pack_cameras`.
         view: (N,) which camera.
         p_world: (N, 3) metres, float32 or float64: the precision of the computation.
 
@@ -108,3 +108,32 @@ def test_single_precision_stays_within_a_thousandth_of_a_pixel():
     pixels, _, _ = project_points(row, np.zeros(len(p), int), p)
     assert pixels.dtype == np.float32
     np.testing.assert_allclose(pixels, camera.project(p)[0], rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        camera_of(False, [-0.3, 0, 0, 0]),
+        camera_of(False, [-0.3, 0.01, 6e-4, -4e-4, 0, 0.02, 0.01, 0]),
+        camera_of(True, [-0.2, 0.01, 0, 0]),
+    ],
+    ids=["brown", "rational", "fisheye"],
+)
+def test_what_is_beyond_the_fold_of_a_lens_stays_outside_the_image(camera):
+    reach = np.sqrt(camera.fold)
+    at = np.tan(reach) if camera.fisheye else reach
+    radius = at * np.array([0.9, 0.999, 1.001, 1.1, 2.0, 5.0])
+    p = np.column_stack([radius, 0.3 * radius, np.ones(6)]) / [np.hypot(1, 0.3), np.hypot(1, 0.3), 1]
+    p = (p - camera.translation) @ camera.rotation
+    row, view = pack_cameras([camera]), np.zeros(6, int)
+    pixels, jacobian, _ = project_points(row, view, p)
+    expected = camera.project(p)[0]
+    np.testing.assert_allclose(pixels[:2], expected[:2], rtol=0, atol=EXACT_PX)
+    assert np.isnan(expected[2:]).all()
+    from_middle = np.linalg.norm(pixels - camera.matrix[:2, 2], axis=1)
+    assert (np.diff(from_middle) > 0).all()
+    h = 1e-6
+    numeric = [
+        (project_points(row, view, p + h * e)[0] - project_points(row, view, p - h * e)[0]) / (2 * h) for e in np.eye(3)
+    ]
+    np.testing.assert_allclose(jacobian, np.stack(numeric, -1), rtol=1e-6, atol=DERIVATIVE)

@@ -17,10 +17,12 @@ def shown_at(image: np.ndarray, rows: np.ndarray, columns: np.ndarray, factor: i
     return image[y[:, None], x]
 
 
-@pytest.mark.parametrize("factor", [1, 2])
-@pytest.mark.parametrize("step", [1, 3, 4])
-def test_every_some_pixels_of_a_reduced_image_are_those_of_the_camera(factor: int, step: int) -> None:
-    size = (48, 72)
+@pytest.mark.parametrize("factor", [1, 2, 3])
+@pytest.mark.parametrize("step", [1, 3, 4, 5, 11])
+@pytest.mark.parametrize("size", [(48, 72), (49, 73), (51, 77)])
+def test_every_some_pixels_of_a_reduced_image_are_those_of_the_camera(
+    factor: int, step: int, size: tuple[int, int]
+) -> None:
     images = image_of(size[0] // factor, size[1] // factor)
     places = (np.arange(step // 2, side, step) for side in size)
     np.testing.assert_array_equal(every(images, size, step)[0], shown_at(images[0], *places, factor))

@@ -164,7 +164,7 @@ def _read(capture: Capture, config: Settings, span: range, compared: set[int], k
     notes = list(capture.warnings)
     label = make_labeller(Task.of(capture, config), notes.append)
     read = _Read({}, {}, {}, {}, tuple({} for _ in capture.rig), PeopleWatch(capture, span), notes)
-    health = ImageHealth()
+    health = ImageHealth(capture.rig.sizes)
     with capture.frames(span.start, span.stop) as reader:
         for frame in reader:
             i, watched = frame.index, read.watch.wants(frame.index)
@@ -175,7 +175,7 @@ def _read(capture: Capture, config: Settings, span: range, compared: set[int], k
                 read.watch.look(i, labels)
             if i in compared:
                 read.masks[i], read.landmarks[i] = labels.masks.copy(), labels.landmarks
-                read.small[i] = sampled(frame.images, labels.masks)
+                read.small[i] = sampled(frame.images, labels.masks, capture.rig.sizes)
                 for bad, reason in zip(read.bad_images, health.look(frame.images, read.masks[i]), strict=True):
                     if reason is not None:
                         bad[i] = FAULTS[reason]

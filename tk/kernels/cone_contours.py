@@ -110,7 +110,7 @@ def load_corner(outlines: ti.template(), c: int, i: int):
 def trace_curve(
     parts: ti.template(),  # (P, 21)
     placed: ti.template(),  # (B, P, 16)
-    cameras: ti.template(),  # (V, 26)
+    cameras: ti.template(),  # (V, 27)
     b: int,
     v: int,
     p: int,

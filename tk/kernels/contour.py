@@ -15,9 +15,6 @@ extrapolates, and fails where they cancel. Linear interpolation, which must be m
 A superellipsoid is convex: on a strip n_d · C crosses 1 at most once in each direction. Slot 0 of a strip is the
 crossing from the hidden to the visible side, slot 1 the opposite one, so the two points never swap: they are a pair
 symmetric about the limb's axis.
-
-A point so far outside an image that the lens model folds back is taken for a point inside; in cameras that see the
-whole volume no pose comes near this.
 """
 
 import functools
@@ -134,7 +131,7 @@ def _contour_kernel(real):
         tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
         pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 20)
         strips: ti.types.ndarray(dtype=real, ndim=3),  # (S, N + 1, 5) η, ω, n_d; in the last row the piece
-        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (C, 26)
+        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (C, 27)
         spread: ti.i32,
         chosen: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, K)
         pose: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
@@ -235,7 +232,7 @@ class ContourKernel:
         angles: (S, N, 2) η and ω along each strip, radians; the last sample is the first.
         normals: (S, N, 3) n_d of eq. 2 there, in the piece's frame, 1/m.
         piece: (S,) the piece of each strip.
-        cameras: (C, 26) of :func:`tk.kernels.projection.pack_cameras`.
+        cameras: (C, 27) of :func:`tk.kernels.projection.pack_cameras`.
         dtype: np.float32, or np.float64 for checks.
     """
 

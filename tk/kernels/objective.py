@@ -63,7 +63,7 @@ def _objective_kernel(real):
         tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
         samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 6)
         pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 24)
-        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (C, 26)
+        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (C, 27)
         voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 3)
         fits: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (V,)
         starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
@@ -121,7 +121,7 @@ def _linearise_kernel(real):
         tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
         samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 6)
         pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 24)
-        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (C, 26)
+        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (C, 27)
         voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 3)
         settings: ti.types.ndarray(dtype=real, ndim=1),  # (13,)
         spread: ti.i32,
@@ -218,7 +218,7 @@ class ObjectiveKernel:
         piece_part: (P,) the part that each piece belongs to.
         piece_patches: (P,) int64 bit masks of the colour patches on each piece: a voxel that fits none of them is not
             covered by the piece.
-        cameras: (C, 26) of :func:`tk.kernels.projection.pack_cameras`, for the alignment term; None without it.
+        cameras: (C, 27) of :func:`tk.kernels.projection.pack_cameras`, for the alignment term; None without it.
         dtype: np.float32, or np.float64 for checks of derivatives.
     """
 

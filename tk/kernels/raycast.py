@@ -47,7 +47,7 @@ FAR = 1e9
 class Rays(NamedTuple):
     """A grid of rays through the pixels of V images."""
 
-    cameras: NDArray[np.floating]  # (V, 26) of :func:`tk.kernels.projection.pack_cameras`
+    cameras: NDArray[np.floating]  # (V, 27) of :func:`tk.kernels.projection.pack_cameras`
     step: int  # pixels between rays; the first goes through pixel ``step // 2``
     directions: NDArray[np.float32]  # (V, H, W, 3) world frame; zero where a camera has no pixel
 
@@ -90,7 +90,8 @@ def _in_row(outline: ti.template(), b: int, v: int, p: int, y: int):
 @ti.func
 def middle_cost(
     placed_middle,
-    cameras: ti.template(),  # (V, 26)
+    cameras: ti.template(),  # (V, 27)
+    rays: ti.template(),  # (V, H, W, 3)
     cost: ti.template(),  # (V, H, W, G + 1)
     outline: ti.template(),  # (B, V, P, _COLUMNS)
     b: int,
@@ -107,8 +108,10 @@ def middle_cost(
     outline[b, v, p, _MIDDLE], outline[b, v, p, _MIDDLE + 1] = pixel[0], pixel[1]
     i = ti.cast(ti.round((pixel[0] - step // 2) / step), ti.i32)
     j = ti.cast(ti.round((pixel[1] - step // 2) / step), ti.i32)
-    more, seen = ti.cast(0.0, ti.f32), 0
+    more, seen, inside = ti.cast(0.0, ti.f32), 0, 0.0
     if depth_m > NEAREST_M and i >= 0 and j >= 0 and i < cost.shape[2] and j < cost.shape[1]:
+        inside = norm_sqr(ti.Vector([rays[v, j, i, a] for a in ti.static(range(3))]))
+    if inside > 0.0:
         more = ti.max(cost[v, j, i, column] - cost[v, j, i, 0], 0.0)
         seen = 1
     return more, seen
@@ -118,7 +121,7 @@ def middle_cost(
 def enclose_part(
     parts: ti.template(),  # (P, 21)
     placed: ti.template(),  # (B, P, 12)
-    cameras: ti.template(),  # (V, 26)
+    cameras: ti.template(),  # (V, 27)
     b: int,
     p: int,
     outline: ti.template(),  # (B, V, P, _COLUMNS) out
@@ -227,7 +230,7 @@ def _cast_kernel(real):
         drawn: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (K,) the parts to draw
         chain: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,) the degrees of freedom that move them
         # the frame
-        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (V, 26)
+        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (V, 27)
         rays: ti.types.ndarray(dtype=ti.f32, ndim=4),  # (V, H, W, 3) world; zero outside the picture
         cost: ti.types.ndarray(dtype=ti.f32, ndim=4),  # (V, H, W, G + 1)
         before_label: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (V, H, W)
@@ -265,7 +268,7 @@ def _cast_kernel(real):
                 store_frame(placed, b, p, M, t)
                 middle, column = times(R, interior_point(kind, shape)) + t, column_of(parts, cost, p)
                 for v in range(V):
-                    more, one = middle_cost(middle, cameras, cost, outline, b, v, p, column, step)
+                    more, one = middle_cost(middle, cameras, rays, cost, outline, b, v, p, column, step)
                     out += ti.cast(more, real)
                     seen += one
             if out / seen > numbers[_MOST_OUTSIDE]:

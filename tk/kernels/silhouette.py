@@ -59,7 +59,7 @@ STEPS, GRADIENT = range(2)
 class Silhouettes(NamedTuple):
     """Masks of V views at one scale."""
 
-    cameras: NDArray[np.floating]  # (V, 26) of :func:`tk.kernels.projection.pack_cameras`, of the full image
+    cameras: NDArray[np.floating]  # (V, 27) of :func:`tk.kernels.projection.pack_cameras`, of the full image
     sizes: NDArray[np.integer]  # (V, 2) width and height of each camera's mask
     # (V, H, W), between 0 and 255 where a pixel is partly covered, :data:`~tk.kernels.mask_values.OTHERS` where it
     # shows another person; or (B V, H, W), each pose's own
@@ -266,7 +266,7 @@ def _descent_kernel(real):
         parts: ti.types.ndarray(dtype=real, ndim=2),  # (P, 21)
         curves: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (Q, 2)
         # the frame
-        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (V, 26)
+        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (V, 27)
         size: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (V, 2) width, height at this scale
         mask: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (F V, H, W) at this scale, of F = 1 or B frames
         image: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (V, H, W, 3) of the full picture

@@ -46,7 +46,7 @@ def really_there(
     """
     if len(found) == 1 and finder.explain(opening[0].masks, found):
         return found
-    agreement = opening_agreement(setup, opening, image_faults(opening))
+    agreement = opening_agreement(setup, opening, image_faults(setup.rig, opening))
     if agreement.refusal or not agreement.wrong:
         return found
     wrong = np.isin(np.arange(len(setup.rig)), agreement.wrong)

@@ -193,7 +193,9 @@ class People:
             raise ConfigError(f"the method {self._first.method} tracks one person who is alone in view")
         try:
             compared = spread_over(opening) if given_masks else ()
-            if reason := mask_contradiction(pairwise(sampled(f.images, f.masks) for f in compared)):
+            if reason := mask_contradiction(
+                pairwise(sampled(f.images, f.masks, self._setup.rig.sizes) for f in compared)
+            ):
                 raise CaptureError(reason)
             self._start(opening, found, numbers)
         except CaptureError as error:

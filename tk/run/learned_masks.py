@@ -113,7 +113,7 @@ class LearnedMasks:
     def __init__(self, task: Task, people: PeopleMasks) -> None:
         setup, source = task.setup, task.source
         self._source, self._settings, self._people = source, task.settings, people
-        self._sizes = [(camera.width, camera.height) for camera in setup.rig]
+        self._sizes = setup.rig.sizes
         self._fps, self._cameras = setup.fps, len(setup.rig)
         self._parts = self._divided(task.settings.silhouette.init_frames)
         self._span = _Span(0, 0, None, ())
@@ -134,7 +134,7 @@ class LearnedMasks:
 
     @property
     def _most_samples(self) -> int:
-        height, width = np.max([(h, w) for w, h in self._sizes], axis=0)
+        width, height = self._sizes.max(axis=0)
         return _SAMPLE_BYTES // (5 * self._cameras * int(height) * int(width))
 
     def label(self, frame: FrameSet) -> tuple[Masks, Bool, NDArray[np.uint8], NDArray[np.float64] | None, Masks | None]:

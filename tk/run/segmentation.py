@@ -230,9 +230,8 @@ def _against_scene(task: Task, clips: Sequence[NDArray[np.uint8]]) -> Labeller:
 
 
 def _learn(task: Task, clips: Sequence[NDArray[np.uint8]]) -> Foreground:
-    setup, settings = task.setup, task.settings
-    sizes = [(camera.width, camera.height) for camera in setup.rig]
-    return CollinearityForeground.learn(clips, setup.rig.frame_shape, sizes, settings.foreground)
+    rig = task.setup.rig
+    return CollinearityForeground.learn(clips, rig.frame_shape, rig.sizes, task.settings.foreground)
 
 
 def _learn_median(task: Task, note: Callable[[str], None]) -> Foreground:
@@ -247,7 +246,7 @@ def _learn_median(task: Task, note: Callable[[str], None]) -> Foreground:
     step = -(-source.frame_count // PLATE_FRAMES)
     with source.frames() as frames:
         samples = [frame.images.copy() for frame in frames if frame.index % step == 0]
-    foreground = _learn(task, median_plate(samples, [(c.width, c.height) for c in setup.rig]))
+    foreground = _learn(task, median_plate(samples, setup.rig.sizes))
     masks = np.array([foreground.label(images)[0] for images in samples]) > 0  # (K, C, H, W)
     from tk.model.hull.coarse import CoarseHull  # SciPy
 

@@ -71,9 +71,9 @@ def spread_over(frames: Sequence[T]) -> list[T]:
     return [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, _OPENING).round().astype(int))]
 
 
-def image_faults(frames: Sequence[Frame]) -> NDArray[np.bool_]:
+def image_faults(rig: Rig, frames: Sequence[Frame]) -> NDArray[np.bool_]:
     """Return (F, C) whether each image of consecutive frames has a fault."""
-    health = ImageHealth()
+    health = ImageHealth(rig.sizes)
     return np.array([[fault is not None for fault in health.look(f.images, f.masks)] for f in frames], np.bool_)
 
 
@@ -148,7 +148,7 @@ class CameraMonitor(Stateful[MonitorState]):
     def __init__(self, tracker: Tracker, setup: Setup, subject: Subject) -> None:
         self.tracker, self._setup, self._subject = tracker, setup, subject
         self._names = setup.rig.names
-        self._health = ImageHealth()
+        self._health = ImageHealth(setup.rig.sizes)
         C = len(self._names)
         self.doubted = np.zeros(C, bool)
         self._cameras = Cameras(C, setup.fps)
@@ -170,10 +170,10 @@ class CameraMonitor(Stateful[MonitorState]):
                 `capture.toml`.
         """
         excludes = self.tracker.can_exclude_cameras  # trackers of hulls need all cameras
-        bad = image_faults(frames) & excludes
+        bad = image_faults(self._setup.rig, frames) & excludes
         agreement = opening_agreement(self._setup, frames, bad)
         if whole and (agreement.refusal or np.count_nonzero(agreement.tested_right) < 2):
-            agreement = opening_agreement(self._setup, whole, image_faults(whole) & excludes)
+            agreement = opening_agreement(self._setup, whole, image_faults(self._setup.rig, whole) & excludes)
         if agreement.refusal:
             raise CaptureError(agreement.refusal)
         if self._region is not None:

@@ -75,6 +75,31 @@ def test_the_mask_holds_the_person_and_not_the_shadow(noise, color):
         assert iou(masks[c], truth[c]) > 0.93
 
 
+@pytest.mark.parametrize("size", [(160, 120), (162, 122), (163, 121), (165, 123)])
+def test_a_person_whom_the_border_cuts_is_seen_up_to_the_border(size):
+    width, height = size
+    scene = np.full((1, height, width, 3), (150.0, 140.0, 120.0))
+    image, rng = scene.copy(), np.random.default_rng(1)
+    image[0, 60:, width - 40 :] = (40, 40, 200)
+    clip = np.stack([expose(scene[0], rng) for _ in range(12)])
+    masks = CollinearityForeground.learn([clip], (height, width), np.array([size])).label(expose(image, rng))[0]
+    assert (masks[0, 64:, width - 36 :] == 255).all()
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_bright_window_is_measured_in_the_camera_and_not_in_the_padding():
+    rng = np.random.default_rng(2)
+    scene = np.full((1, 120, 160, 3), (150.0, 140.0, 120.0))
+    clip = np.stack([expose(scene[0], rng) for _ in range(12)])
+    lamp = expose(scene * 1.03, rng)  # the light has changed a little
+    lamp[0, 40:80, 50:70] = (40, 40, 200)
+    alone = CollinearityForeground.learn([clip], SHAPE, SIZES[:1]).label(lamp)[0]
+    wide = np.zeros((1, 240, 400, 3), np.uint8)
+    wide[:, :120, :160] = lamp
+    padded = CollinearityForeground.learn([clip], (240, 400), SIZES[:1]).label(wide)[0]
+    np.testing.assert_array_equal(padded[:, :120, :160], alone)
+
+
 def test_images_that_are_reduced_already_give_the_same_masks(learned):
     scene, _, foreground = learned
     images = expose(with_person(scene, (40, 40, 200))[0], np.random.default_rng(3))

@@ -141,3 +141,28 @@ def test_frame_ranges_are_described_in_words() -> None:
     assert described(12, 12, 1) == "frame 12"
     assert described(30, 74, 45) == "frames 30 to 74"
     assert described(30, 74, 12) == "12 of the frames 30 to 74"
+
+
+def test_faults_of_a_camera_do_not_depend_on_the_size_of_the_others() -> None:
+    """The images of smaller cameras lie in the upper left of larger ones."""
+    rng, sizes = np.random.default_rng(0), np.array([[W, H], [W, H], [2 * W, 2 * H], [W, H]])
+    alone, padded = ImageHealth(), ImageHealth(sizes)
+    scene = np.kron(rng.integers(0, 200, (C, 12, 16, 3)), np.ones((1, 8, 8, 1))).astype(np.uint8)
+    found, last = [], np.zeros((H, W, 3), np.uint8)
+    for t in range(36):
+        images, masks = frame(t, rng)
+        images = np.where(masks[..., None] > 0, images, scene)
+        if 8 <= t < 20:
+            images[0], masks[0] = np.roll(images[0], 3, axis=1), np.roll(masks[0], 3, axis=1)
+        if t == 30:
+            images[1] = 128
+        images[3] = last if 8 <= t < 20 else images[3]
+        last = images[3].copy()
+        layers = (np.zeros((C, 2 * H, 2 * W, 3), np.uint8), np.zeros((C, 2 * H, 2 * W), np.uint8))
+        for whole, part in zip(layers, (images, masks), strict=True):
+            whole[:, :H, :W] = part
+            whole[2] = np.repeat(np.repeat(part[2], 2, axis=0), 2, axis=1)
+        reasons = padded.look(*layers)
+        assert reasons == alone.look(images, masks)
+        found += reasons
+    assert {MOVED, "blank", "frozen"} <= set(found)

@@ -58,3 +58,12 @@ def test_the_box_holds_a_hand_beyond_an_invisible_sleeve(at, size):
 
 def test_image_sizes_that_are_no_multiple_of_a_cell():
     assert look(person, (243, 322)) == AROUND_THE_PERSON
+
+
+@pytest.mark.parametrize("shape", [(240, 320), (243, 322), (241, 323)])
+def test_the_box_of_a_person_whom_the_border_cuts_ends_at_the_border(shape):
+    def cut(picture):
+        picture[150:, 290:] = (30, 30, 200)
+
+    left, top, width, height = look(cut, shape)
+    assert (left + width, top + height) == shape[::-1]

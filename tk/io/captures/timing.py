@@ -29,6 +29,8 @@ DRIFT_FRAMES = 0.5
 ROUNDED = 0.002
 #: intervals longer than the median by this factor have a missing image in them
 _GAP = 1.5
+# Seconds from one image to the next, at most: times in milliseconds are 33 apart, and nobody's motion is seen so.
+_LONGEST_S = 2.0
 #: share of an interval by which a nearest image may be farther away than half an interval: time stamps are rounded,
 #: often to milliseconds
 ROUNDED_INTERVAL = 0.05
@@ -121,11 +123,13 @@ def _read(path: Path, clip: Clip) -> Stamps:
         except ValueError:
             if number:
                 raise CaptureError(f"{path}: line {number + 1}: {shown(line)} must be seconds, one number") from None
-    if len(seconds) < clip.frame_count:
+    if len(seconds) != clip.frame_count:
         raise CaptureError(f"{path}: has {len(seconds)} times, and {clip.path} has {clip.frame_count} images")
-    times = np.array(seconds[: clip.frame_count])
+    times = np.array(seconds)
     if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
         raise CaptureError(f"{path}: its times must be finite and increase from line to line")
+    if (apart := float(np.median(np.diff(times)))) > _LONGEST_S:
+        raise CaptureError(f"{path}: its times must be seconds, and are {apart:.4g} apart")
     return Stamps(path, times, common=True)
 
 

@@ -141,7 +141,7 @@ class Layout:
             "distortions": [np.pad(camera.distortions, (0, 8 - len(camera.distortions))) for camera in cameras.rig],
             "rotation": [cv2.Rodrigues(camera.rotation)[0].ravel() for camera in cameras.rig],
             "translation": [camera.translation for camera in cameras.rig],
-            "size": [(camera.width, camera.height) for camera in cameras.rig],
+            "size": cameras.rig.sizes,
             "fisheye": [camera.fisheye for camera in cameras.rig],
             "time_offset": cameras.time_offset_s,
         }

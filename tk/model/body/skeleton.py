@@ -269,6 +269,11 @@ class Skeleton:
         """Return the largest distance (...) of the joints of poses (..., D) from others (J, 3), metres."""
         return np.asarray(np.linalg.norm(self.joints(poses) - joints, axis=-1).max(axis=-1))
 
+    def steps(self, poses: Float) -> Float:
+        """Return the steps (F - 1, D) of poses (F, D), of angles the shorter way round."""
+        steps = np.diff(poses, axis=0)
+        return np.where(self.prismatic, steps, (steps + np.pi) % (2 * np.pi) - np.pi)
+
     def joint_jacobian(self, poses: Float) -> Float:
         """Return the derivatives (..., J, 3, D) of :meth:`joints` at poses (..., D)."""
         return self.point_jacobian(poses, self.joint_segment, self.joints(poses))

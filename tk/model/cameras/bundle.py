@@ -331,7 +331,7 @@ def bundle_frames(
     chosen = []
     for i in rows:
         frame_set = np.stack([person.masks(int(frames[i]) - n)[c] for c, n in enumerate(delays)])
-        velocity = 0.5 * (poses[i + 1] - poses[i - 1])
+        velocity = person.body.skeleton.steps(poses[i - 1 : i + 2]).mean(axis=0)
         chosen.append(BundleFrame(views.pyramid(frame_set, scales, cleaning), poses[i], velocity))
     return chosen
 

@@ -128,11 +128,11 @@ class Camera:
         pixels = np.column_stack([xy[:, a] * self.matrix[a, a] + self.matrix[a, 2] for a in range(2)])
         if self.matrix[0, 1] != 0.0:
             pixels[:, 0] += self.matrix[0, 1] * xy[:, 1]
-        pixels[bent > self._fold] = np.nan
+        pixels[bent > self.fold] = np.nan
         return np.asarray(pixels, np.float64)
 
     @cached_property
-    def _fold(self) -> float:
+    def fold(self) -> float:
         """Squared radius (fisheye: angle from the axis) up to which the distorted radius grows; infinite if always.
 
         Far outside the image the distortion's polynomial folds back: such a point is not visible.
@@ -217,6 +217,11 @@ class Rig:
     def frame_shape(self) -> tuple[int, int]:
         """(height, width) of packed image stacks: the largest of all cameras."""
         return max(c.height for c in self.cameras), max(c.width for c in self.cameras)
+
+    @property
+    def sizes(self) -> NDArray[np.int64]:
+        """(C, 2) width and height of each camera's images, pixels."""
+        return np.array([(c.width, c.height) for c in self.cameras])
 
     @property
     def centers(self) -> Float:

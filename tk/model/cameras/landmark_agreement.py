@@ -82,9 +82,9 @@ def associated(rig: Rig, landmarks: Float) -> Float:
         shown = _Sets.of(Rig((camera,) * len(people)), landmarks[:, c]) if people else None
         fit = np.array([pairs.fit_without(c, shown) for pairs in people if shown is not None])
         fit = fit.reshape(len(landmarks), len(landmarks))
-        free = np.ones(len(landmarks), np.bool_)
         open_to = np.isfinite(fit)
         judged = open_to.any(axis=1)
+        free = judged.copy()  # who keeps a set that cannot be tested shares it with nobody
         result[judged, c] = np.nan
         for k in np.argsort(-np.where(open_to, fit, -np.inf), axis=None, kind="stable"):
             person, given = np.unravel_index(k, fit.shape)

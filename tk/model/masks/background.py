@@ -126,12 +126,6 @@ def gain_and_noise(images: Images, plates: Float, relative: Float) -> tuple[Floa
     return np.where(seen[:, None], gain, 1).astype(np.float32), np.where(seen, variance, 0).astype(np.float32)
 
 
-def median(values: Float) -> Float:
-    """Return the median of each row (C, N), the upper one of two, as (C,)."""
-    middle = values.shape[1] // 2
-    return np.asarray(np.partition(values, middle, axis=1)[:, middle], np.float32)
-
-
 def _medians(values: Float, count: NDArray[np.int_]) -> Float:
     """Return the median of the ``count`` (C,) smallest values of each row (C, N), as (C,)."""
     ranks = np.minimum(count // 2, values.shape[1] - 1).tolist()

@@ -39,7 +39,6 @@ from tk.model.masks.background import (
     gain_and_noise,
     learn_scene,
     mean_scene,
-    median,
     reduced,
     relative_noise,
     samples,
@@ -200,10 +199,11 @@ class CollinearityForeground:
         if learned is not None and learned.unknown.any():
             self._unknown = learned.unknown.view(np.uint8)
             self._small_unknown = _any(learned.unknown)
-        self.plates = plates
+        self.plates, self._sizes = plates, sizes
         self._height = int(np.median(sizes[:, 1])) // _REDUCTION
         self._scene = _Scene.of(reduced(plates, _REDUCTION), config.shadow_min, self._height)
         self._small = np.empty_like(self._scene.plates)
+        self._windows = _windows_inside(sizes // _REDUCTION, self._small.shape[1:3])
         self._small_scenes = np.empty_like(self._scene.plates)
         self._noise_floor = noise_floor.astype(np.float32)
         self._noise_samples = samples(relative[..., None])[:, 0]
@@ -317,6 +317,12 @@ class CollinearityForeground:
         whole = doubled(doubt)
         for c in range(len(images)):
             np.greater(full.part(whole, c), full.crop(masks[c], c), out=full.crop(uncertain[c], c))
+            width, height = self._sizes[c].tolist()
+            for layer in (masks[c], uncertain[c]):
+                if width % _REDUCTION:  # a last column that is in no square shows what the one before shows
+                    layer[:, width - 1] = layer[:, width - 2]
+                if height % _REDUCTION:
+                    layer[height - 1] = layer[height - 2]
         return masks, uncertain
 
     def _averaged(self, noisy: NDArray[np.bool_]) -> _Scene:
@@ -330,13 +336,18 @@ class CollinearityForeground:
     def _bright_sums(self, scene: _Scene, gains: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return (C,) the least sum over a window, image minus scene, that makes its pixel foreground.
 
-        The noise of these sums is measured over the whole image, most of which shows the scene.
+        The noise of these sums is measured over the whole image of the camera, most of which shows the scene.
         """
         differences = _window_sums(self._small) - scene.sums * gains[:, None]
         brighter = (differences * np.array(GREY, np.float32)).sum(axis=2)
-        middle = median(brighter)
-        deviation = 1.4826 * median(np.abs(brighter - middle[:, None]))  # of a normal distribution
-        return np.asarray(middle + _BRIGHT_DEVIATIONS * deviation, np.float32)
+        least = np.empty(len(brighter), np.float32)
+        for c, inside in enumerate(self._windows):
+            own = brighter[c, inside]
+            middle = np.median(own)
+            least[c] = middle + _BRIGHT_DEVIATIONS * 1.4826 * np.median(
+                np.abs(own - middle)
+            )  # of a normal distribution
+        return least
 
     def _decide(self, mosaic: Mosaic, prior: Prior | None, noise: NDArray[np.float32]) -> tuple[Images, Images]:
         """Return mosaics of reduced images, 0 or 1: the person, and the uncertain pixels; ``noise``: (C,) variances."""
@@ -415,6 +426,14 @@ def _window_sums(images: Images) -> NDArray[np.uint16]:
     for part in parts[1:]:
         total += part
     return total.reshape(len(images), -1, 3)
+
+
+def _windows_inside(sizes: NDArray[np.int_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return (C, N) which windows of :func:`_window_sums`, of images of ``shape`` (h, w), are inside the images of
+    cameras of these sizes (C, 2)."""
+    y, x = (np.arange(0, side - 2, _BRIGHT_STEP) + 2 for side in shape)
+    inside = (y[:, None] < sizes[:, 1, None, None]) & (x < sizes[:, 0, None, None])
+    return np.asarray(inside.reshape(len(sizes), -1))
 
 
 def _gathered(mosaic: Mosaic, images: Images) -> NDArray[np.bool_]:

@@ -36,8 +36,8 @@ _MOVED_LEVELS, _MOVED_SHARE = 40, 0.005
 # Least probability that an image changes more where its mask changes than beside the masks.
 _FOLLOWS = 0.87
 
-Sampled = tuple[NDArray[np.int16], NDArray[np.bool_]]
-"""Images (C, h, w, 3) and masks (C, h, w) of a frame, every some pixels."""
+Sampled = tuple[NDArray[np.int16], NDArray[np.bool_], NDArray[np.bool_]]
+"""Images (C, h, w, 3) and masks (C, h, w) of a frame, every some pixels, and which of these each camera has."""
 
 MOVED = "moved"  #: the fault of a camera that has been moved since the first frame
 
@@ -62,12 +62,14 @@ class _Look(NamedTuple):
 
     Attributes:
         shown, small: (C, h, w) every some pixels of the images, and of the masks.
+        inside: (C, h, w) which of them a camera has, if some cameras are smaller.
         moved: see :class:`ImageHealth`.
         given: whether there are images.
     """
 
     shown: NDArray[np.uint8]
     small: NDArray[np.bool_]
+    inside: NDArray[np.bool_]
     moved: NDArray[np.float64]
     given: bool
 
@@ -82,6 +84,9 @@ class ImageHealth(Stateful[HealthState]):
     The still parts of the image of a camera that stands firm stay where they are, see
     :class:`~tk.model.masks.image_shift.ImageShift`.
 
+    Args:
+        sizes: (C, 2) width and height of each camera's mask; None: all are as large as the stack of masks.
+
     Attributes:
         moved: (C,) by which share of its longer side each image has moved since the first frame; NaN if it is unknown.
             None before the first frame.
@@ -89,10 +94,11 @@ class ImageHealth(Stateful[HealthState]):
 
     State = HealthState
 
-    def __init__(self) -> None:
+    def __init__(self, sizes: NDArray[np.integer] | None = None) -> None:
+        self._sizes = sizes
         self._references: NDArray[np.uint8] | None = None
         self._masks: NDArray[np.bool_] | None = None
-        self._shift = ImageShift()
+        self._shift = ImageShift(sizes)
         self.moved: NDArray[np.float64] | None = None
 
     def look(
@@ -112,13 +118,14 @@ class ImageHealth(Stateful[HealthState]):
         # the green channel suffices
         shown = _thinned(images, masks)[..., 1].copy() if given else small * np.uint8(255)
         self.moved = moved = self._shift.look(images, masks, doubtful) if given else np.full(C, np.nan)
-        look = _Look(shown, small, moved, given)
+        look = _Look(shown, small, _inside(self._sizes, masks), moved, given)
         faulty = {name: measure(self, look) for name, (_, measure) in IMAGE_FAULTS.items()}
         return [next((name for name, cameras in faulty.items() if cameras[c]), None) for c in range(C)]
 
     def _blank(self, look: _Look) -> NDArray[np.bool_]:
         """Return (C,) cameras whose image has one colour."""
-        return look.given & np.asarray(look.shown.reshape(len(look.shown), -1).std(axis=1) < _BLANK_LEVELS)
+        deviation = [shown[inside].std() for shown, inside in zip(look.shown, look.inside, strict=True)]
+        return look.given & (np.array(deviation) < _BLANK_LEVELS)
 
     def _has_moved(self, look: _Look) -> NDArray[np.bool_]:
         """Return (C,) cameras whose image is elsewhere than in the first frame."""
@@ -132,7 +139,7 @@ class ImageHealth(Stateful[HealthState]):
             self._references, self._masks = look.shown, np.repeat(look.small[None], C, axis=0)
             return found
         differs = cv2.absdiff(look.shown, self._references) > _SAME_LEVELS
-        still = differs.reshape(C, -1).mean(axis=1) <= _SAME_SHARE
+        still = differs.sum(axis=(1, 2)) <= _SAME_SHARE * look.inside.sum(axis=(1, 2))
         for c in range(C):
             if not still[c]:
                 self._references[c], self._masks[c] = look.shown[c], look.small
@@ -151,15 +158,25 @@ IMAGE_FAULTS: Mapping[str, tuple[str, Callable[[ImageHealth, _Look], NDArray[np.
 }
 
 
-def sampled(images: NDArray[np.uint8], masks: NDArray[np.uint8]) -> Sampled:
+def sampled(images: NDArray[np.uint8], masks: NDArray[np.uint8], sizes: NDArray[np.integer] | None = None) -> Sampled:
     """Return what :func:`mask_contradiction` needs of a frame: images (C, h, w, 3), of the masks' size or reduced, and
-    masks (C, H, W)."""
-    return _thinned(images, masks).astype(np.int16), _thinned(masks, masks) >= PERSON
+    masks (C, H, W); ``sizes`` as of :class:`ImageHealth`."""
+    return _thinned(images, masks).astype(np.int16), _thinned(masks, masks) >= PERSON, _inside(sizes, masks)
 
 
 def _thinned(images: NDArray[np.uint8], masks: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return images (C, h, w, ...) at every some pixels of the masks (C, H, W)."""
     return every(images, masks.shape[1:], max(1, masks.shape[1] // _ROWS))
+
+
+def _inside(sizes: NDArray[np.integer] | None, masks: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return (C, h, w) which of the pixels of :func:`_thinned` belong to cameras of these sizes (C, 2)."""
+    C, height, width = masks.shape
+    if sizes is None:
+        sizes = np.full((C, 2), (width, height))
+    step = max(1, height // _ROWS)
+    y, x = np.arange(step // 2, height, step), np.arange(step // 2, width, step)
+    return np.asarray((y[:, None] < sizes[:, 1, None, None]) & (x < sizes[:, 0, None, None]))
 
 
 def mask_contradiction(pairs: Iterable[tuple[Sampled, Sampled]]) -> str | None:
@@ -172,21 +189,22 @@ def mask_contradiction(pairs: Iterable[tuple[Sampled, Sampled]]) -> str | None:
         pairs: of frames about a third of a second apart; empty images and empty masks are not compared.
     """
     follows, stands = defaultdict[int, list[NDArray[np.float64]]](list), True  # by camera
-    moved = np.zeros(0, bool)  # (C, h, w), pixels whose image changes
-    for (image, mask), (later_image, later_mask) in pairs:
+    moved, share = np.zeros(0, bool), np.zeros(0)  # (C, h, w) pixels whose image changes, and (C,) their share
+    for (image, mask, inside), (later_image, later_mask, _) in pairs:
         if not image.size:
             continue
         differs = np.abs(image - later_image).max(axis=3)
         moved = differs > _MOVED_LEVELS if not moved.size else moved | (differs > _MOVED_LEVELS)
+        share = moved.sum(axis=(1, 2)) / inside.sum(axis=(1, 2))
         stands &= bool((mask == later_mask).all())
         for c, (levels, before, now) in enumerate(zip(differs, mask, later_mask, strict=True)):
             near = cv2.dilate(levels, np.ones((3, 3), np.uint8))  # an outline may lie some pixels off
-            beside = np.sort(near[~(before | now)])
+            beside = np.sort(near[inside[c] & ~(before | now)])
             if len(beside) and before.any() and now.any() and _changed(before, now) > _MOVED:
                 changed = near[before != now]
                 rank = np.searchsorted(beside, changed, "left") + np.searchsorted(beside, changed, "right")
                 follows[c].append(rank / (2 * len(beside)))
-    if moved.size and stands and np.median(moved.mean(axis=(1, 2))) > _MOVED_SHARE:
+    if len(share) and stands and np.median(share) > _MOVED_SHARE:
         return "the masks never change, but the images do: the masks do not show who moves"
     if follows and np.median([np.concatenate(ranks).mean() for ranks in follows.values()]) < _FOLLOWS:
         return "the images do not change where the masks change: the masks belong to other frames or to other videos"

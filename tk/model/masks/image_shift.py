@@ -22,6 +22,7 @@ from tk.model.stateful import Stateful
 
 Float = NDArray[np.float64]
 Gray = NDArray[np.float32]
+Masks = NDArray[np.uint8]
 
 # Longer side of a registered image, pixels.
 _SIZE = 96
@@ -49,8 +50,9 @@ class ShiftState:
     """What is known of C cameras.
 
     Attributes:
-        first: (C, h, w) the images that later ones are registered with; None before the first frame.
-        still: (C, h, w) where nobody is in them.
+        first: (C, n, n) the images that later ones are registered with, each in the upper left; None before the first
+            frame.
+        still: (C, n, n) where nobody is in them.
         begun: (C,) whether a camera's mask could be trusted in a frame.
         shift: (C, 2) pixels.
         calls: number of frames.
@@ -64,11 +66,16 @@ class ShiftState:
 
 
 class ImageShift(Stateful[ShiftState]):
-    """Registers the images of consecutive frames with those of the first one, one camera in every second frame."""
+    """Registers the images of consecutive frames with those of the first one, one camera in every second frame.
+
+    Args:
+        sizes: (C, 2) width and height of each camera's mask; None: all are as large as the stack of masks.
+    """
 
     State = ShiftState
 
-    def __init__(self) -> None:
+    def __init__(self, sizes: NDArray[np.integer] | None = None) -> None:
+        self._sizes = sizes
         self._first: NDArray[np.uint8] | None = None
         self._still = np.zeros((0, 0, 0), np.bool_)
         self._begun = np.zeros(0, np.bool_)
@@ -81,36 +88,47 @@ class ImageShift(Stateful[ShiftState]):
         """Return (C,) how far each camera's image has moved, as a share of its longer side; NaN if it is unknown.
 
         Args:
-            images: (C, H, W, 3) BGR, of any but always the same size.
-            masks: (C, h, w), not 0 where somebody is.
+            images: (C, h, w, 3) BGR, of the masks' size or reduced.
+            masks: (C, H, W), not 0 where somebody is.
             doubtful: (C,) cameras whose mask may not show the person. A camera's first image is that of its first frame
                 without doubt: the person must not be taken for a part of the scene. None: no camera.
         """
         C = len(images)
-        if self._first is None or len(self._first) != C:
-            self._first = np.stack([_small(image[..., 1]) for image in images])
+        if self._first is None:
+            self._first = np.zeros((C, _SIZE, _SIZE), np.uint8)
             self._still = np.zeros(self._first.shape, np.bool_)
             self._begun, self._shift, self._calls = np.zeros(C, np.bool_), np.zeros((C, 2)), 0
         for c in np.flatnonzero(~self._begun).tolist():
-            self._first[c] = _small(images[c, ..., 1])  # the green channel suffices
-            self._still[c] = _beside(masks[c])
+            image, beside = self._small(c, images, masks)
+            box = slice(image.shape[0]), slice(image.shape[1])
+            self._first[c][box], self._still[c][box] = image, beside
         self._begun |= True if doubtful is None else ~doubtful
         if self._calls % _PAUSE:
             self._look_at(self._calls // _PAUSE % C, images, masks)
         self._calls += 1
         return np.asarray(np.hypot(*self._shift.T) / _SIZE)
 
+    def _small(self, c: int, images: NDArray[np.uint8], masks: NDArray[np.uint8]) -> tuple[Masks, NDArray[np.bool_]]:
+        """Return a camera's image (h, w) at low resolution, and where nobody is in it."""
+        width, height = masks.shape[:0:-1] if self._sizes is None else self._sizes[c].tolist()
+        scale, factor = _SIZE / max(width, height), masks.shape[1] // images.shape[1]
+        size = max(1, round(scale * width)), max(1, round(scale * height))
+        image = images[c, : height // factor, : width // factor, 1]  # the green channel suffices
+        return _resized(image, size), _beside(_resized(masks[c, :height, :width], size))
+
     def _look_at(self, c: int, images: NDArray[np.uint8], masks: NDArray[np.uint8]) -> None:
         """Measure a camera's shift."""
         assert self._first is not None
-        first, now = _details(self._first[c]), _details(_small(images[c, ..., 1]))
-        still_now = _beside(masks[c])
+        image, still_now = self._small(c, images, masks)
+        box = slice(image.shape[0]), slice(image.shape[1])
+        first, now = _details(self._first[c][box]), _details(image)
         if still_now.mean() < _FREE:  # no mask of a person; that of a moved camera shows half of the scene
             still_now[:] = True
-        still = self._still[c] & still_now
+        still_first = self._still[c][box]
+        still = still_first & still_now
         shift, correlation = _register(first, now, still, np.nan_to_num(self._shift[c]))
         if correlation < _LEAST_CORRELATION:  # a jump is out of the reach of small steps
-            shift, correlation = _register(first, now, still, _jump(first * self._still[c], now * still_now))
+            shift, correlation = _register(first, now, still, _jump(first * still_first, now * still_now))
         self._shift[c] = shift if correlation >= _LEAST_CORRELATION else np.nan
 
 
@@ -145,11 +163,9 @@ def exchanged_scenes(
     return found
 
 
-def _small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return an image (H, W) at low resolution."""
-    scale = _SIZE / max(image.shape)
-    every = max(1, int(1 / (3 * scale)))  # the mean of fewer pixels suffices
-    size = [max(1, round(scale * side)) for side in image.shape[::-1]]
+def _resized(image: NDArray[np.uint8], size: tuple[int, int]) -> Masks:
+    """Return an image (H, W) at a lower resolution of ``size``, width and height."""
+    every = max(1, max(image.shape) // (3 * max(size)))  # the mean of fewer pixels suffices
     return np.asarray(cv2.resize(image[::every, ::every], size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
@@ -159,9 +175,9 @@ def _details(image: NDArray[np.uint8]) -> Gray:
     return np.asarray(cv2.GaussianBlur(gray, (0, 0), _FINE) - cv2.GaussianBlur(gray, (0, 0), _COARSE), np.float32)
 
 
-def _beside(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Return (h, w) where nobody is in a mask (H, W), at low resolution, with a margin for the details' blur."""
-    return np.asarray(cv2.dilate(_small(mask), np.ones((9, 9), np.uint8)) == 0)
+def _beside(mask: Masks) -> NDArray[np.bool_]:
+    """Return (h, w) where nobody is in a mask at low resolution, with a margin for the details' blur."""
+    return np.asarray(cv2.dilate(mask, np.ones((9, 9), np.uint8)) == 0)
 
 
 def _jump(first: Gray, now: Gray) -> Float:

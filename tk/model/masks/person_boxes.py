@@ -74,7 +74,8 @@ class PersonBoxes:
             x, y, w, h = (2 * n for n in _largest(mask, cells[c]))
             if w > 0:
                 left, top = max(x - self._margin, 0), max(y - self._margin, 0)
-                right, bottom = min(x + w + self._margin, 2 * width), min(y + h + self._margin, 2 * height)
+                right = min(x + w + self._margin, images.shape[2])  # also of a last column that is in no square
+                bottom = min(y + h + self._margin, images.shape[1])
                 boxes[c] = left, top, right - left, bottom - top
         return boxes
 

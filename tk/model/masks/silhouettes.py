@@ -70,7 +70,7 @@ class Views:
         self.rig = rig
         self.cameras = pack_cameras(rig)
         self._cameras32 = self.cameras.astype(np.float32)
-        self.sizes = np.array([(c.width, c.height) for c in rig], np.int32)
+        self.sizes = rig.sizes.astype(np.int32)
 
     def pyramid(self, masks: Masks, scales: int, cleaning: bool, measured: Measured | None = None) -> Pyramid:
         """Return the scales of masks (V, H, W), cleaned if ``cleaning``, and what was measured in the frame."""

@@ -33,8 +33,8 @@ class MotionTerm:
     """
 
     def __init__(self, skeleton: Skeleton, poses: Float, frames: NDArray[np.int64]) -> None:
-        self._prismatic = skeleton.prismatic
-        changes = np.diff(self._steps(poses), axis=0)[_between_steps(frames)] ** 2
+        self._skeleton = skeleton
+        changes = np.diff(skeleton.steps(poses), axis=0)[_between_steps(frames)] ** 2
         # With white acceleration of variance q, two steps in turn differ by 2/3 q in the mean square.
         self._variance = np.full(poses.shape[1], np.inf)
         if len(changes):
@@ -43,17 +43,12 @@ class MotionTerm:
                 found = (_tail(changes, found + _LEAST**2) * changes).mean(axis=0)
             self._variance = 1.5 * found + _LEAST**2
 
-    def _steps(self, poses: Float) -> Float:
-        """Return the steps (F - 1, D) of poses (F, D), of angles the shorter way round."""
-        steps = np.diff(poses, axis=0)
-        return np.where(self._prismatic, steps, (steps + np.pi) % (2 * np.pi) - np.pi)
-
     def add(self, equations: Equations, poses: Float, frames: NDArray[np.int64]) -> None:
         """Add the term at poses (N, D) of frames (N,) to the equations of N blocks. The speeds are those of the
         poses."""
         if not np.isfinite(self._variance).all():
             return
-        steps = self._steps(poses)
+        steps = self._skeleton.steps(poses)
         total, count = 2.0 * steps, np.full((len(steps), 1), 2.0)
         both = np.flatnonzero(_between_steps(frames))
         for here, beside in ((both + 1, both), (both, both + 1)):
