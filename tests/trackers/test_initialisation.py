@@ -22,6 +22,7 @@ from tk.settings import SilhouetteSettings
 from tk.trackers.hypotheses import DROPPED, TrajectoryHypothesis, walking
 from tk.trackers.initialisation import find_in, find_person, stature_of
 from tk.trackers.protocol import Frame
+from tk.trackers.region import RegionTracker
 from tk.trackers.silhouette import SilhouetteTracker
 
 STATURE = 1.75
@@ -275,6 +276,23 @@ def test_landmarks_tell_the_heading_that_silhouettes_leave_open() -> None:
         assert "landmarks" in pyramid.measured
         score = tracker.cost(pyramid, tracker.world.poses_in(np.stack([facing, back])))
         assert (score[0] < score[1]) == (pose is facing)
+
+
+@pytest.mark.parametrize("opposite", [False, True])
+def test_a_network_is_asked_for_the_heading_that_the_opening_leaves_open(opposite: bool) -> None:
+    """The masks show the person in both headings; the first frame decides for the opening."""
+    both = [placed(standing_pose(SKELETON), yaw) for yaw in (0.6, 0.6 + np.pi)]
+    masks, asked = draw_silhouettes(BODY, RIG, np.stack(both)).max(axis=0), []
+
+    def network(points: np.ndarray) -> np.ndarray:
+        asked.append(points)
+        return landmarks_of(RIG, BODY, both[opposite], 0.03)
+
+    tracker = RegionTracker(RIG, "z", SilhouetteSettings(adapt=False))
+    frames = [Frame(i, np.zeros((3, 0, 0, 3), np.uint8), masks, ask=network) for i in range(3)]
+    tracker.start(frames, Subject(height_m=STATURE, in_init_pose=False))
+    pose = tracker.world.poses_out(tracker.last_poses()[0][None])
+    assert len(asked) == 1 and error(SKELETON.joints(pose), both[opposite][None])[0] < 0.06
 
 
 def test_start_with_landmarks_begins_with_their_pose(monkeypatch) -> None:

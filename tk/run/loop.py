@@ -125,16 +125,24 @@ class Loop:
         if output and done:
             output.check_open()
             self._restore(output)
-            yield from self._step_through(plan.observations.frames(plan.begin + done, plan.stop))
+            yield from self._step_through(self._with_network(plan.observations.frames(plan.begin + done, plan.stop)))
             return
         # The body is fitted to the same frames however few are asked for, so that --resume may extend a run.
         count = self._opening_frames()
-        observations = plan.observations.frames(plan.first, None if plan.stop is None else plan.stop + count)
+        stop = None if plan.stop is None else plan.stop + count
+        observations = self._with_network(plan.observations.frames(plan.first, stop))
         _LOG.info("reading the first frames and learning what the scene looks like")
         plan.tracker.prepare(with_landmarks=bool(sources_of_masks(plan.task.source)))
         yield from self._step_through(self._started(observations, count))
         if not self.people.written:
             raise CaptureError(f"{plan.task.source.where}: nobody could be tracked: {self.people.refusal}")
+
+    def _with_network(self, observations: Iterator[Observed]) -> Iterator[Observed]:
+        """Yield the observations, with a network that may be asked for landmarks if there is one."""
+        for observation, laps in observations:
+            if self._ask is not None and observation.images.size:
+                observation = replace(observation, ask=partial(self._ask, observation.images))
+            yield observation, laps
 
     def _started(self, observations: Iterator[Observed], count: int) -> Iterator[Observed]:
         """Yield the observations; start the trackers before the first frame with somebody in the volume is yielded.
@@ -251,8 +259,6 @@ class Loop:
     def _step(self, observation: Frame) -> tuple[Estimate, ...] | None:
         """Step all trackers; return the estimates of the people in the result, None before the first frame to be
         written."""
-        if self._ask is not None and observation.images.size:
-            observation = replace(observation, ask=partial(self._ask, observation.images))
         with one_thread():
             answers = self.people.step(observation)
         if observation.index < self.plan.begin:

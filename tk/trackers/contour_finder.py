@@ -40,7 +40,7 @@ from tk.optim.gauss_newton import BatchSolution, GaussNewtonSettings
 from tk.optim.quadratic import Quadratic
 from tk.settings import SilhouetteSettings
 from tk.trackers.hypotheses import PROPOSED, SAME_POSE_M, TrajectoryHypothesis, turning
-from tk.trackers.initialisation import MOST_STATURE_RATIO, FoundPoses, find_in, find_person, stature_of
+from tk.trackers.initialisation import MOST_STATURE_RATIO, FoundPoses, find_in, find_person, stature_of, weighed
 from tk.trackers.proposals import exchanged, limbs
 from tk.trackers.proposals.anywhere import centroid
 from tk.trackers.protocol import Frame
@@ -219,6 +219,10 @@ class ContourFinder:
             begun = self._begin(frames[0], pyramids[0], subject, len(frames) == 1)
         seen = [self.see(blind(f), pyramid=shown) for f, shown in zip(frames, pyramids, strict=True)]
         hypotheses = find_person(self, seen, begun.rough, begun.found)
+        # where the silhouettes of the opening leave the pose open, which way the person faces for example
+        if len(hypotheses) > 1 and (asked := self.asked(frames[0], pyramids[0], hypotheses[0].poses[0])):
+            hypotheses = weighed(self, hypotheses, seen[0], self.see(blind(frames[0]), pyramid=asked))
+            pyramids[0] = asked
         if not self.settings.adapt or subject.body is not None:
             return np.asarray(hypotheses[0].poses[0])
         expected = BodyDimensions.from_stature(stature or stature_of(self, pyramids, subject.hull_m))
@@ -303,6 +307,15 @@ class ContourFinder:
         pyramid = self.views.pyramid(frame.masks, self.solver.scales, True)
         marked = landmarks.of_person(frame.landmarks, pyramid.masks[0])
         return pyramid if marked is None else replace(pyramid, measured={landmarks.NAME: marked})
+
+    def asked(self, frame: Frame, pyramid: Pyramid, pose: Float) -> Pyramid | None:
+        """Return a frame's silhouettes with a network's landmarks of the person, who is expected at a pose (D,); None
+        if there is no network, the frame has its landmarks, or they show somebody else."""
+        if frame.ask is None or frame.landmarks is not None:
+            return None
+        found = frame.ask(self.world.points_out(landmarks.points(self.body, pose)))
+        marked = landmarks.of_person(None if found is None else found[None], pyramid.masks[0])
+        return None if marked is None else replace(pyramid, measured={**pyramid.measured, landmarks.NAME: marked})
 
     def sighted(self, seen: Float) -> RenderedBody | None:
         """Return the average body on the grid :attr:`fine_grid`, at the pose that a person's landmarks (V, L, 4) show;
@@ -440,5 +453,5 @@ class ContourFinder:
 
 
 def blind(frame: Frame) -> Frame:
-    """Return the frame without images, for what does not use colours."""
-    return replace(frame, images=frame.images[:0])
+    """Return the frame without images, for what does not use colours, and without a network to ask."""
+    return replace(frame, images=frame.images[:0], ask=None)

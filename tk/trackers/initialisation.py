@@ -109,9 +109,32 @@ def find_person(
     for anchor, group in groupby([*clear, *(alternatives[i][1:] for i in sorted(likeliest))], itemgetter(0)):
         new = [pose for _, pose in group if not _contains(skeleton, hypotheses, anchor, pose)]
         hypotheses += _follow(finder, seen, new, anchor)
-    hypotheses.sort(key=lambda hypothesis: hypothesis.cost)
-    hypotheses = [one for one in hypotheses if one.cost <= hypotheses[0].cost + DROPPED]
+    hypotheses = _likely(hypotheses)
     return [hypotheses[i] for i in distinct(skeleton.joints(np.array([one.poses for one in hypotheses])), DISTINCT_M)]
+
+
+def _likely(hypotheses: Sequence[TrajectoryHypothesis]) -> list[TrajectoryHypothesis]:
+    """Return the hypotheses that are not improbable, best first."""
+    ranked = sorted(hypotheses, key=lambda hypothesis: hypothesis.cost)
+    return [one for one in ranked if one.cost <= ranked[0].cost + DROPPED]
+
+
+def weighed(
+    finder: ContourFinder, hypotheses: Sequence[TrajectoryHypothesis], before: Seen, after: Seen
+) -> list[TrajectoryHypothesis]:
+    """Return the hypotheses that are not improbable, best first, when more is known of the first frame.
+
+    A hypothesis costs the mean of its frames, because they err alike; what one frame shows beside that counts like a
+    measurement in all of them.
+
+    Args:
+        finder: with an average body.
+        hypotheses: of :func:`find_person`.
+        before, after: what the first frame showed, and shows.
+    """
+    poses = np.array([one.poses[0] for one in hypotheses])
+    more = after.evidence.cost(finder.body, poses) - before.evidence.cost(finder.body, poses)
+    return _likely([one._replace(cost=one.cost + float(add)) for one, add in zip(hypotheses, more, strict=True)])
 
 
 def _contains(skeleton: Skeleton, hypotheses: Sequence[TrajectoryHypothesis], frame: int, pose: Float) -> bool:

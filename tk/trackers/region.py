@@ -265,16 +265,10 @@ class RegionTracker(ContourTracker[RegionState]):
         return bool((variance > landmarks.deviation(np.ones(1)) ** 2).any())
 
     def _ask(self, seen: Seen, pose: Float) -> Seen | None:
-        """Return what a frame shows with a network's landmarks of the person, who is expected at a pose (D,); None if
-        there is no network, the frame has its landmarks, or they show somebody else."""
-        frame, pyramid = seen.frame, seen.pyramid
-        if frame.ask is None or frame.landmarks is not None:
-            return None
-        found = frame.ask(self.world.points_out(landmarks.points(self.body, pose)))
-        marked = landmarks.of_person(None if found is None else found[None], pyramid.masks[0])
-        if marked is None:
-            return None
-        return self.see(frame, seen.images, replace(pyramid, measured={**pyramid.measured, landmarks.NAME: marked}))
+        """Return what a frame shows with a network's landmarks of the person, who is expected at a pose (D,); None as
+        :meth:`asked`."""
+        pyramid = self.asked(seen.frame, seen.pyramid, pose)
+        return None if pyramid is None else self.see(seen.frame, seen.images, pyramid)
 
     def kept(self, frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.uint16] | None]:
         """Return what a second pass needs of a frame that was tracked: masks and colors as in
