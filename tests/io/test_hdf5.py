@@ -106,7 +106,7 @@ def near_structure(data: bytes, share: float) -> int:
 
 
 # the same examples each time: a new one may find a new way to hang HDF5 itself, which is a task, not a broken build
-@settings(max_examples=120, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     name=st.sampled_from(["result.h5", "truth.h5"]),
     patched=patches,
