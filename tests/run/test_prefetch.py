@@ -146,11 +146,11 @@ def test_notes_of_the_process_are_reported(tmp_path: Path) -> None:
 
 def test_an_error_is_raised_at_its_frame(copy: Path, tmp_path: Path) -> None:
     capture = open_capture(copy)
-    broken = sorted((copy / "masks").iterdir())[1] / "000007.png"
+    broken = sorted((copy / "masks").iterdir())[1] / "000002.png"
     broken.write_bytes(broken.read_bytes()[:40])
-    with pytest.raises(VideoError, match=r"000007\.png: is not a picture that can be decoded"):
+    with pytest.raises(VideoError, match=r"000002\.png: is not a picture that can be decoded"):
         track(capture, tmp_path / "r.h5", AHEAD)
-    np.testing.assert_array_equal(read_result(tmp_path / "r.h5").frames, np.arange(7))
+    np.testing.assert_array_equal(read_result(tmp_path / "r.h5").frames, np.arange(2))
 
 
 def test_an_error_while_learning_the_background_is_raised(copy: Path) -> None:
