@@ -92,14 +92,6 @@ def test_version(tk: Tk) -> None:
     assert tk("--version").out.strip().endswith(__version__)
 
 
-def test_help_lists_each_command_with_its_purpose(tk: Tk) -> None:
-    """Commands that have moved are not listed; their old names print the new ones."""
-    listed = tk("--help").out.split("Commands:")[1].splitlines()
-    rows = [line.split(maxsplit=1) for line in listed if re.match(r"  \w", line)]
-    assert {"track", "sync"} <= {row[0] for row in rows} and all(len(row) == 2 for row in rows)
-    tk("level", "x").complaint("tk calibrate CAPTURE --level")
-
-
 def test_demo_tracks_and_prints_the_accuracy(
     tk: Tk, tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

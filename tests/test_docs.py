@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +28,19 @@ PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *s
 POSE_NAMES = build_skeleton(BodyDimensions.from_stature(1.7)).names
 
 
+@cache
+def text_of(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
 def blocks(page: Path, language: str) -> list[str]:
     """The fenced blocks of a language."""
-    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S)
+    return re.findall(rf"^```{language}\n(.*?)^```", text_of(page), re.M | re.S)
 
 
 def headings(page: Path) -> set[str]:
     """The anchors of a page's headings."""
-    found = re.findall(r"^#+ (.*)", page.read_text(encoding="utf-8"), re.M)
+    found = re.findall(r"^#+ (.*)", text_of(page), re.M)
     return {re.sub(r"[^\w -]", "", line).strip().lower().replace(" ", "-") for line in found}
 
 
@@ -50,40 +56,36 @@ def shell_commands(page: Path) -> list[str]:
     return [line for line in lines if line.startswith("tk ")]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_have_a_target(page: Path) -> None:
-    for target in re.findall(r"\]\(([^)]+)\)", page.read_text(encoding="utf-8")):
+def test_links_have_a_target() -> None:
+    for page, target in ((one, target) for one in PAGES for target in re.findall(r"\]\(([^)]+)\)", text_of(one))):
         if "://" in target:
             continue
         name, _, heading = target.partition("#")
         other = page.parent / name if name else page
-        assert other.exists(), target
-        assert not heading or heading in headings(other), target
+        assert other.exists(), (page.name, target)
+        assert not heading or heading in headings(other), (page.name, target)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_named_files_exist(page: Path) -> None:
-    text = page.read_text(encoding="utf-8")
+def test_named_files_exist() -> None:
+    text = "".join(map(text_of, PAGES))
     for name in re.findall(r"\b(?:tk|scripts|tests|docs)/[\w/.-]+\.\w+", text):
         assert (ROOT / name).exists(), name
     for module in re.findall(r"python -m (scripts\.\w+)", text):
         assert (ROOT / module.replace(".", "/")).with_suffix(".py").exists(), module
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_commands_and_options_exist(page: Path) -> None:
+def test_commands_and_options_exist() -> None:
     assert isinstance(main, click.Group)
-    for command, rest in re.findall(r"(?:^|`)tk (\w+)([^`\n#]*)", page.read_text(encoding="utf-8"), re.M):
+    for command, rest in re.findall(r"(?:^|`)tk (\w+)([^`\n#]*)", "".join(map(text_of, PAGES)), re.M):
         assert command in main.commands, command
         known = {name for parameter in main.commands[command].params for name in parameter.opts}
         assert set(re.findall(r"(?<!\w)(--?[a-z][\w-]*)", rest)) <= known | {"--help"}, command + rest
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_commands_are_accepted(page: Path) -> None:
+def test_commands_are_accepted() -> None:
     """Each parses as the real command line does it."""
     assert isinstance(main, click.Group)
-    for line in shell_commands(page):
+    for line in (line for page in PAGES for line in shell_commands(page)):
         words = shlex.split(re.sub(r"\s[|>]\s.*", "", line), comments=True)[1:]
         if words[0].startswith("-"):
             assert {words[0]} <= {"--help", "--version"}, line
@@ -112,10 +114,10 @@ def test_commands_that_need_no_recording_run(
         assert ran.code == 0, (lines[line].name, line, ran.err)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_python_examples_compile(page: Path) -> None:
-    for text in blocks(page, "python"):
-        compile(text, str(page), "exec")
+def test_python_examples_compile() -> None:
+    for page in PAGES:
+        for text in blocks(page, "python"):
+            compile(text, str(page), "exec")
 
 
 def test_settings_example_is_accepted() -> None:
@@ -128,7 +130,7 @@ def test_named_settings_exist() -> None:
     tree = parse_toml(settings_file.to_toml(Settings()), "settings")
     found = 0
     for page in PAGES:
-        for path in re.findall(r"`(\w+\.[\w.]+)(?: = [^`]*)?`", page.read_text(encoding="utf-8")):
+        for path in re.findall(r"`(\w+\.[\w.]+)(?: = [^`]*)?`", text_of(page)):
             table, *names = path.split(".")
             if not isinstance(tree.get(table), dict) or page.name == "CHANGELOG.md":
                 continue
@@ -176,15 +178,13 @@ def test_every_page_is_in_the_index_and_in_the_readme() -> None:
         assert all(f"({folder}{page}.md" in text for page in pages), readme
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_pages_have_no_directives_that_github_shows_as_text(page: Path) -> None:
-    assert not re.findall(r"^[`:]{3,}\{.*|\{[\w:]+\}`", page.read_text(encoding="utf-8"), re.M)
+def test_pages_have_no_directives_that_github_shows_as_text() -> None:
+    assert not re.findall(r"^[`:]{3,}\{.*|\{[\w:]+\}`", "".join(map(text_of, PAGES)), re.M)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_tables_begin_with_their_heading(page: Path) -> None:
+def test_tables_begin_with_their_heading() -> None:
     """An empty line inside a table splits it, and the rest is shown as text."""
-    lines = ["", *page.read_text(encoding="utf-8").splitlines(), ""]
+    lines = ["", *(line for page in PAGES for line in [*text_of(page).splitlines(), ""])]
     for before, line, after in zip(lines, lines[1:], lines[2:], strict=False):
         if line.startswith("|") and not before.startswith("|"):
             assert re.fullmatch(r"\|[-:| ]+\|", after), line
@@ -194,5 +194,5 @@ def test_lines_of_documentation_are_short() -> None:
     for page in PAGES:
         if page.name == "CHANGELOG.md":
             continue
-        for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1):
+        for number, line in enumerate(text_of(page).splitlines(), 1):
             assert len(line) <= 100 or line.startswith("|"), f"{page.name}:{number}"

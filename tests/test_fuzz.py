@@ -12,7 +12,7 @@ from scripts.fuzz import KINDS, Base, make_case
 from tests.conftest import Tk
 
 #: cases of each kind in a normal run; half of them are refused
-CASES = 6
+CASES = 4
 #: seconds for a case on a busy machine; the first ones compile kernels
 LIMIT_S = 60.0
 

@@ -19,7 +19,7 @@ FILES = {
 
 def imports(node: ast.AST) -> Iterator[str]:
     """Yield the modules of tk that a syntax tree imports, inside functions too, except for type annotations."""
-    if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+    if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
         return
     if isinstance(node, ast.Import):
         yield from (alias.name for alias in node.names if alias.name in FILES)

@@ -83,6 +83,7 @@ def test_settings_missing_in_a_file_keep_their_default() -> None:
         ('segmentation = "mog2"', ["segmentation"]),
         ("voxels = 2", ["voxels = 2", "8 to 512"]),
         ("seed = -1", ["seed = -1"]),
+        ("ahead = -1", ["ahead = -1", "0 to 64"]),
         ("[silhouette]\nprediction = 7.0", ["prediction = 7.0"]),
         ("[silhouette]\nprediction = 2", ["prediction = 2"]),
         ("[smd]\nmemory = 0.3", ["unknown setting smd"]),

@@ -94,7 +94,6 @@ def missed(grey: Grey, board: Board) -> str:
             "markers of another dictionary are found: give --dictionary 4x4_50",
         ),
         (make_board("charuco", "5x4", 0.11), "a board 7x5 of these markers is found: give --size 7x5"),
-        (make_board("charuco", "9x6", 0.11), "a board 7x5 of these markers is found: give --size 7x5"),
         pytest.param(
             make_board("chessboard", None, 0.11),
             "a charuco 7x5 of 4x4_50 is found: give --board charuco --size 7x5",

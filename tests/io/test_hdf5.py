@@ -106,7 +106,7 @@ def near_structure(data: bytes, share: float) -> int:
 
 
 # the same examples each time: a new one may find a new way to hang HDF5 itself, which is a task, not a broken build
-@settings(max_examples=120, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     name=st.sampled_from(["result.h5", "truth.h5"]),
     patched=patches,
@@ -140,7 +140,7 @@ DATASETS = [
 VALUES = [
     np.float64(1e300), np.full((COUNT, 24), np.inf), np.full(COUNT, -1), np.full((COUNT, 15, 3), 1e300), "text",
     np.arange(COUNT, dtype=np.uint64) + 2**63, np.full(COUNT, 2.5), np.zeros(COUNT, dtype=[("a", "f8"), ("b", "i4")]),
-    np.zeros((0, 3)), np.array([True] * COUNT), np.full((COUNT, 15), -1.0), np.zeros(COUNT, complex),
+    np.zeros((0, 3)), np.full((COUNT, 15), -1.0), np.zeros(COUNT, complex),
 ]  # fmt: skip
 
 

@@ -293,7 +293,7 @@ def test_rows_are_the_normals_of_the_picture_in_the_world():
         np.testing.assert_allclose(edgels.row[here], np.einsum("ni,nij->nj", edgels.normal[here], J), atol=1e-3)
 
 
-@pytest.mark.parametrize("k", range(D))
+@pytest.mark.parametrize("k", range(0, D, 3))
 def test_rows_are_derivatives_of_the_contour(k):
     """A generator's image is a line; where it meets the old normal moves as the row says."""
     settings = SearchSettings(tangential=0.0, most_samples=3, spacing_px=0.25, window_px=12, interior=True)

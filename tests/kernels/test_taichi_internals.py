@@ -181,16 +181,3 @@ def test_an_unknown_context_gets_the_full_note():
         SimpleNamespace(ASTTransformerContext=context), SimpleNamespace(textwrap=textwrap)
     )
     assert context().get_pos_info(None) == "full"
-
-
-def test_a_callers_own_runtime_keeps_its_notes():
-    printed = run(
-        """
-        from tk.kernels.runtime import ensure_runtime, ti
-        ti.init(arch=ti.cpu, log_level=ti.ERROR)
-        ensure_runtime()
-        from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
-        print(hasattr(ASTTransformerContext.get_pos_info, "__wrapped__"))
-        """
-    )
-    assert printed[-1] == "False"

@@ -139,7 +139,7 @@ def test_masks_show_everybody(walk: Path, tmp_path: Path, monkeypatch: pytest.Mo
     label = make_labeller(Task.of(capture, Settings()), notes.append)
     assert "the segmenter red makes the masks" in notes[0] and "every frame" in notes[1] and len(notes) == 2
     with capture.frames() as frames:
-        for frame in islice(frames, 0, None, 3):
+        for frame in islice(frames, 0, None, 6):
             assert wrong(label(frame).masks, truth(walk, frame.index, everybody=True)).max() < 0.1, frame.index
 
 

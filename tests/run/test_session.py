@@ -104,14 +104,15 @@ def test_a_run_interrupted_twice_equals_an_uninterrupted_one(
 ) -> None:
     run_clock(monkeypatch, EVERY_FRAME)
     result, capture = tmp_path / "r.h5", open_capture(tiny)
-    for frame in (0, 8):
-        summary = track(capture, result, CONFIG, StopAt(frame), resume=True, store_hull=True)
+    options: dict[str, Any] = {"frames": (0, 8), "store_hull": True, "resume": True}
+    for frame in (0, 4):
+        summary = track(capture, result, CONFIG, StopAt(frame), **options)
         assert summary.interrupted and summary.frames == frame + 1
     reporter = Silent()
-    summary = track(capture, result, CONFIG, reporter, resume=True, store_hull=True)
-    assert (summary.interrupted, summary.frames, summary.tracked_now) == (False, FRAMES, FRAMES - 9)
-    assert (reporter.total, reporter.done, reporter.frames) == (FRAMES, 9, list(range(9, FRAMES)))
-    assert_same(result, tracked)
+    summary = track(capture, result, CONFIG, reporter, **options)
+    assert (summary.interrupted, summary.frames, summary.tracked_now) == (False, 8, 3)
+    assert (reporter.total, reporter.done, reporter.frames) == (8, 5, [5, 6, 7])
+    assert_same(result, tracked, slice(0, 8))
 
 
 def test_frames_are_reported_after_they_are_written(
@@ -120,10 +121,10 @@ def test_frames_are_reported_after_they_are_written(
     run_clock(monkeypatch, 1e-9)
     result, capture = tmp_path / "r.h5", open_capture(tiny)
     stopped = StopAt(3)
-    summary = track(capture, result, CONFIG, stopped, frames=(0, 8), store_hull=True)
+    summary = track(capture, result, CONFIG, stopped, frames=(0, 5), store_hull=True)
     assert summary.interrupted and stopped.frames == [0, 1, 2, 3]  # by then all of them were finished
-    assert summary.frames == summary.tracked_now == 8
-    assert_same(result, tracked, slice(0, 8))
+    assert summary.frames == summary.tracked_now == 5
+    assert_same(result, tracked, slice(0, 5))
 
 
 def test_ctrl_c_before_the_first_frame_leaves_an_older_result(
@@ -254,19 +255,16 @@ def test_starts_from_angles(tiny: Path, tracked: Path, tmp_path: Path) -> None:
     assert np.median(np.linalg.norm(found.joints - known.joints[5:9], axis=2)) < 0.06
 
 
-def test_an_initial_pose_past_the_end(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
-    joints = {name: [0.1 * (k % 2), 0.05 * k, 1.0] for k, name in enumerate(JOINTS)}
-    file = pose_file(tmp_path / "pose.toml", {"frame": 99, "joints": joints})
-    tk(
-        "track", tiny, "--method", "volumetric", "-o", tmp_path / "r.h5", "--config", quick, "--init-pose", file
-    ).complaint("pose.toml", "99", "13")
-
-
-def test_an_initial_pose_in_millimetres(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
-    joints = {name: [100.0 * (k % 2), 50.0 * k, 1000.0] for k, name in enumerate(JOINTS)}
-    file = pose_file(tmp_path / "pose.toml", {"joints": joints})
+@pytest.mark.parametrize(
+    ("frame", "unit", "parts"), [(99, 1, ["99", "13"]), (0, 1000, ["outside the working volume", "metres"])]
+)
+def test_an_initial_pose_past_the_end_or_in_millimetres(
+    tk: Tk, quick: Path, tiny: Path, tmp_path: Path, frame: int, unit: int, parts: list[str]
+) -> None:
+    joints = {name: [0.1 * unit * (k % 2), 0.05 * unit * k, 1.0 * unit] for k, name in enumerate(JOINTS)}
+    file = pose_file(tmp_path / "pose.toml", {"frame": frame, "joints": joints})
     ran = tk("track", tiny, "--method", "volumetric", "-o", tmp_path / "r.h5", "--config", quick, "--init-pose", file)
-    ran.complaint("pose.toml", "outside the working volume", "metres")
+    ran.complaint("pose.toml", *parts)
 
 
 def test_masks_that_never_change_are_refused(tk: Tk, copy: Path, tmp_path: Path) -> None:

@@ -378,21 +378,6 @@ def everybody(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, ...]:
     return track_entering(tmp_path_factory.mktemp("entering") / "r.h5")
 
 
-@pytest.fixture(scope="module")
-def second(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, tuple[Subject, ...]]:
-    """The person who enters, chosen by number, and the subjects whose trackers were started."""
-    start, subjects = RegionTracker.start, []
-
-    def watch(tracker: RegionTracker, frames: Sequence[Frame], subject: Subject) -> None:
-        subjects.append(subject)
-        start(tracker, frames, subject)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(RegionTracker, "start", watch)
-        (found,) = track_entering(tmp_path_factory.mktemp("entering") / "r.h5", (1,))
-    return found, tuple(subjects)
-
-
 def test_somebody_who_enters_gets_a_number_and_who_leaves_is_absent(everybody: tuple[Result, ...]) -> None:
     first, second = everybody
     assert not (first.status >= Status.LOST).any()
@@ -411,13 +396,20 @@ def test_cameras_that_were_moved_show_nobody_who_enters(tmp_path: Path, monkeypa
     assert len(track_entering(tmp_path / "r.h5", stop=9)) == 1
 
 
-def test_somebody_who_enters_later_can_be_chosen(second: tuple[Result, tuple[Subject, ...]]) -> None:
-    found, subjects = second
-    np.testing.assert_array_equal(found.frames, np.arange(ENTERING))
+def test_somebody_who_enters_later_can_be_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    start, subjects = RegionTracker.start, list[Subject]()
+
+    def watch(tracker: RegionTracker, frames: Sequence[Frame], subject: Subject) -> None:
+        subjects.append(subject)
+        start(tracker, frames, subject)
+
+    monkeypatch.setattr(RegionTracker, "start", watch)
+    (found,) = track_entering(tmp_path / "r.h5", (1,), stop=10)
+    np.testing.assert_array_equal(found.frames, np.arange(10))
     (here,) = np.nonzero(found.status != Status.ABSENT)
-    assert 1 < here[0] < 11 and not (found.status == Status.LOST).any()
+    assert 1 < here[0] < 10 and not (found.status == Status.LOST).any()
     np.testing.assert_array_equal(np.isfinite(found.pose).all(axis=1), found.status != Status.ABSENT)
-    np.testing.assert_array_equal(here, np.arange(here[0], 12))
+    np.testing.assert_array_equal(here, np.arange(here[0], 10))
     joints = np.array([BODY.skeleton.joints(pose) for pose in ENTER[1][here]])
     assert np.median(np.linalg.norm(found.joints[here] - joints, axis=2)) < 0.1  # coarse settings
     assert [subject.body for subject in subjects] == [None, BODY]  # the subject is the one who is chosen
@@ -425,8 +417,8 @@ def test_somebody_who_enters_later_can_be_chosen(second: tuple[Result, tuple[Sub
 
 def test_a_run_with_somebody_who_enters_later_is_resumed(everybody: tuple[Result, ...], tmp_path: Path) -> None:
     """Stopped before, and after the person enters; people are in the order in which they came."""
-    path, people, end = tmp_path / "part.h5", (1, 0), 12
-    for stop in (1, 10):
+    path, people, end = tmp_path / "part.h5", (1, 0), 10
+    for stop in (1, 9):
         track_entering(path, people, stop, resume=stop != 1)
     for one, other in zip(track_entering(path, people, end, resume=True), everybody, strict=True):
         assert (other.status[:end] != Status.ABSENT).any()
@@ -452,5 +444,5 @@ def test_attempts_to_track_somebody_who_is_refused_are_twice_as_far_apart_each_t
         start(tracker, frames, subject)
 
     monkeypatch.setattr(RegionTracker, "start", refuse_others)
-    found = track_entering(tmp_path / "r.h5", stop=12, fps=2.0)
+    found = track_entering(tmp_path / "r.h5", stop=11, fps=2.0)
     assert len(found) == 1 and attempts == [0, 7, 8, 10]  # from the eighth frame on

@@ -81,7 +81,7 @@ def scene(tiny: Path) -> Scene:
     return Scene(tiny)
 
 
-@pytest.mark.parametrize("times", [0.95, 1.05, 1.2])
+@pytest.mark.parametrize("times", [0.95, 1.2])
 def test_a_height_that_the_silhouettes_contradict_is_refused(scene: Scene, times: float) -> None:
     assert scene.capture.subject_height_m is not None
     tracker, subject = scene._tracker(), Subject(times * scene.capture.subject_height_m)

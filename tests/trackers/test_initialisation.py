@@ -15,7 +15,6 @@ from tk.model.body.body_points import LANDMARKS
 from tk.model.body.cone_body import build_cone_body
 from tk.model.body.gait_poses import neutral_pose, standing_pose, walking_pose
 from tk.model.body.skeleton import JOINTS, shoulder_angles
-from tk.model.cues.ray_costs import Evidence
 from tk.model.setup import InitPose, Subject
 from tk.optim.gauss_newton import BatchSolution
 from tk.settings import SilhouetteSettings
@@ -70,7 +69,7 @@ def error(joints: np.ndarray, poses: np.ndarray) -> np.ndarray:
     return np.linalg.norm(joints - [SKELETON.joints(p) for p in poses], axis=2).mean(axis=1)
 
 
-@pytest.mark.parametrize("yaw", [0.3, 2.0, 4.4])
+@pytest.mark.parametrize("yaw", [0.3, 4.4])
 def test_heading_of_a_t_pose_is_found_from_the_feet(yaw: float) -> None:
     """Arms level and straight, legs straight, standing still: only the feet differ."""
     t_pose = arms(standing_pose(SKELETON), (0, 1, 0), (0, 1, 0))
@@ -121,30 +120,7 @@ def test_hypothesis_whose_fitted_body_has_the_lower_cost_is_chosen(monkeypatch) 
     assert error(SKELETON.joints(pose)[None], right[None])[0] < 0.02
 
 
-def test_poses_with_similar_costs_in_one_frame_all_become_hypotheses(monkeypatch) -> None:
-    """In the first frame the wrong pose has the lower cost, by little."""
-    right = placed(arms(standing_pose(SKELETON), (1, 0.6, 0.3), (0.2, 1, -0.6)), 0.6)
-    wrong = placed(arms(standing_pose(SKELETON), (0.2, 0.3, 1), (-0.3, 1, 0.6)), 0.6)
-    masks = draw_silhouettes(BODY, RIG, np.array([right] * 4))
-    frames = [Frame(i, np.zeros(0, np.uint8), m) for i, m in enumerate(masks)]
-    tracker = tracker_of()
-    monkeypatch.setattr(
-        tracker, "settle", lambda _, starts, *__: BatchSolution(np.array(starts), np.zeros(3, np.int32))
-    )
-    starts = tracker.world.poses_in(np.array([wrong, *3 * [right]]))
-    monkeypatch.setattr("tk.trackers.proposals.anywhere.gait.gait_figures", lambda *_: starts)
-    monkeypatch.setattr("tk.trackers.proposals.opposite.propose", lambda *_: starts)
-    costs = {False: 20.0, True: 20.5}
-    inside = tracker.world.poses_in(right)
-    monkeypatch.setattr(Evidence, "cost", lambda _, __, poses: np.array([costs[np.allclose(p, inside)] for p in poses]))
-    monkeypatch.setattr(tracker, "mean_residual", lambda _, poses, __: np.full(len(poses), 0.21))
-    monkeypatch.setattr(tracker, "improved", lambda _, pose: pose)
-    hypotheses = find_person(tracker, [tracker.see(frame) for frame in frames])
-    assert [hypothesis.cost for hypothesis in hypotheses] == pytest.approx([20.0, 20.5])
-    assert error(SKELETON.joints(hypotheses[1].poses[0])[None], inside[None])[0] < 1e-6
-
-
-@pytest.mark.parametrize("stature", [1.2, 1.6, 1.95])
+@pytest.mark.parametrize("stature", [1.2, 1.95])
 def test_estimated_stature_hardly_depends_on_the_pose(stature: float) -> None:
     body = build_cone_body(BodyDimensions.from_stature(stature))
     standing = standing_pose(SKELETON)
@@ -176,7 +152,7 @@ def test_lower_hull_corrects_the_stature_of_wide_clothes(monkeypatch, hull_m: fl
 
 
 @pytest.mark.parametrize("elsewhere", [("wrist_l",), ("wrist_l", "wrist_r", "knee_r")])
-@pytest.mark.parametrize("stature", [1.2, 1.6, 1.95])
+@pytest.mark.parametrize("stature", [1.2, 1.95])
 def test_landmarks_show_the_stature_of_somebody_who_sits_with_a_low_hull(
     stature: float, elsewhere: tuple[str, ...]
 ) -> None:

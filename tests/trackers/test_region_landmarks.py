@@ -88,7 +88,7 @@ def test_landmarks_that_nobody_is_seen_with_change_nothing() -> None:
         assert other.landmarks is None
 
 
-@pytest.mark.parametrize("k", range(len(POSES)))
+@pytest.mark.parametrize("k", [0, 3])
 def test_landmarks_that_the_silhouettes_deny_enlarge_sigma_and_do_not_move_the_arms(k: int) -> None:
     raised = with_arm(with_arm(POSES[k], "l", (0, 0.2, 1), 0.0), "r", (0, 0.2, 1), 0.0)
     plain, denied = (

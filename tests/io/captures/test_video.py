@@ -193,8 +193,7 @@ def test_a_reduced_video_equals_the_reduced_images_of_the_video(tmp_path: Path, 
         assert np.abs(read - squares.mean(axis=(1, 3))).mean() < 3
 
 
-@pytest.mark.parametrize("factor", [2, 3, 4, 6])
-@pytest.mark.parametrize("pixels", ["yuv420p", "yuv422p", "yuv444p", "yuv420p10le"])
+@pytest.mark.parametrize(("pixels", "factor"), [("yuv420p", 2), ("yuv422p", 3), ("yuv444p", 4), ("yuv420p10le", 6)])
 @pytest.mark.parametrize("full_range", [False, True])
 @pytest.mark.parametrize("bt709", [False, True])
 def test_the_planes_of_every_coding_give_the_colors_that_ffmpeg_gives(

@@ -29,7 +29,7 @@ from tk.model.cameras.mounting import infer_up
 
 NAMES = ["26578", "26579", "26580", "26581"]
 RIG = renamed(make_rig(), *NAMES)
-DAMAGES = 40
+DAMAGES = 20
 
 
 def write_projections(folder: Path) -> None:
