@@ -205,7 +205,7 @@ class _Finisher:
                 report=self.within,
             )
             # a joint that the first pass knew nothing about stays unknown
-            sigma = np.where(np.isnan(draft.current("evidence/sigma")), np.nan, precise)
+            sigma = np.where(draft.lost[:, None] | np.isnan(draft.current("evidence/sigma")), np.nan, precise)
             error = np.where(draft.lost, draft.current("objective"), mean_error(residual))
             draft.columns |= {"pose": poses, "residual": residual, "evidence/sigma": sigma, "objective": error}
             draft.refined = True

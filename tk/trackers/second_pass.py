@@ -96,7 +96,8 @@ class SecondPass:
         self._pyramid = _unpacked(tracker.views, masks, measured, np.isfinite(residual[..., 0]), self._kept)
         self.tracked = np.flatnonzero(~lost)
         self._share = np.ones(len(poses))
-        steps, seen = _steps(tracker.body.skeleton.joints(poses[self.tracked])), len(self.tracked)
+        joints, seen = tracker.body.skeleton.joints(poses[self.tracked]), len(self.tracked)
+        steps = _steps(joints, np.diff(self.tracked))
         self._share[self.tracked] = np.clip(steps / CORRELATED_M, 1.0 / min(tracker.fps * STILL_S, seen), 1.0)
         self.poses, self.residual = poses.copy(), np.array(residual)
         self._variance = np.zeros((2, len(poses), len(JOINTS)))  # of the pose, and of the choice
@@ -262,9 +263,10 @@ def _unpacked(
     return pyramid
 
 
-def _steps(joints: Float) -> Float:
-    """Return (F,) how far the fastest of the joints (F, J, 3) moves in a frame, mean of the steps before and after."""
-    steps = np.sqrt((np.diff(joints, axis=0) ** 2).sum(axis=-1)).max(axis=-1)
+def _steps(joints: Float, apart: NDArray[np.int64]) -> Float:
+    """Return (F,) how far the fastest of the joints (F, J, 3) moves in a frame, mean of the steps before and after;
+    (F - 1,) frames that neighbours are ``apart``."""
+    steps = np.sqrt((np.diff(joints, axis=0) ** 2).sum(axis=-1)).max(axis=-1) / apart
     beside = np.concatenate([steps[:1], steps, steps[-1:]]) if len(steps) else np.zeros(2)
     return np.asarray((beside[:-1] + beside[1:]) / 2.0)
 
