@@ -17,6 +17,7 @@ import pytest
 from scripts.browser import Page, browser_page, find_browser
 from tests.conftest import FRAMES, Tk
 from tests.report.conftest import LOST, NOTE, with_partner
+from tk.cli import main
 from tk.evaluation.joints import evaluate_files
 from tk.io.results.data import Result
 from tk.io.results.reader import read_result
@@ -223,12 +224,19 @@ def wait_for(page: Page, condition: str, seconds: float = 20.0) -> None:
         time.sleep(0.05)
 
 
+@pytest.fixture(scope="module")
+def report(complete: Path, tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The complete result's report, read-only."""
+    path = tmp_path_factory.mktemp("report") / "walk.html"
+    main(["report", str(complete), str(tiny), "-o", str(path)], standalone_mode=False)
+    return path
+
+
 @pytest.fixture
-def opened(complete: Path, tiny: Path, page: Page, tmp_path: Path, tk: Tk) -> Page:
-    """The complete result's report in the browser, at its first frame."""
-    tk("report", complete, tiny, "-o", tmp_path / "walk.html")
+def opened(report: Path, page: Page) -> Page:
+    """The report in the browser, at its first frame."""
     page.said.clear()
-    page.open(tmp_path / "walk.html")
+    page.open(report)
     return page
 
 
@@ -357,8 +365,8 @@ def test_people_with_different_frames_are_aligned(complete: Path) -> None:
 
 
 @chromium
-def test_page_fits_a_small_screen(opened: Page, tmp_path: Path) -> None:
-    opened.open(tmp_path / "walk.html", 390, 800)
+def test_page_fits_a_small_screen(opened: Page, report: Path) -> None:
+    opened.open(report, 390, 800)
     assert opened.run("document.documentElement.scrollWidth <= window.innerWidth") is True, "nothing sticks out"
     assert opened.run("document.getElementById('scrubber').getBoundingClientRect().width") > 250
     assert opened.said == []
