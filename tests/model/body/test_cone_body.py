@@ -32,7 +32,20 @@ def points_of(body, pose):
 
 def test_components_are_those_of_the_paper_and_the_pelvis():
     assert len({part.component for part in BODY.parts}) == 15
-    assert [part.component for part in BODY.parts if part.kind == ELLIPSOID] == ["head"]
+    assert [part.component for part in BODY.parts if part.kind == ELLIPSOID] == ["head", "thigh_l", "thigh_r"]
+
+
+def test_a_bent_knee_is_round_and_its_ball_has_no_contours():
+    pose = standing_pose(BODY.skeleton)
+    pose[BODY.skeleton.index("knee_l_flexion")] = np.radians(120)
+    owner, points = points_of(BODY, pose)
+    names = [part.name for part in BODY.parts]
+    knee = BODY.skeleton.joints(pose)[JOINTS.index("knee_l")]
+    out = np.array([0.5, 0.0, -np.sqrt(0.75)])  # halfway between the axes of thigh and calf, away from both
+    reach = {n: ((points[owner == names.index(n)] - knee) @ out).max() for n in ("thigh_l", "calf_l", "knee_l")}
+    assert max(reach["thigh_l"], reach["calf_l"]) + 0.01 < reach["knee_l"] < DIMENSIONS.knee_radius
+    drawn = {names[p] for p in BODY.arrays.curves[:, 0]}
+    assert set(names) - drawn == {"knee_l", "knee_r"}
 
 
 def test_standing_body_has_the_stature_of_its_dimensions():

@@ -52,8 +52,9 @@ def test_limb_has_the_ends_of_its_cone_and_nearly_straight_sides(m):
 
 
 def test_every_part_has_a_piece_at_its_place():
-    assert [piece.segment for piece in BODY.pieces] == [part.segment for part in CONES.parts]
-    for part, piece in zip(CONES.parts, BODY.pieces, strict=True):
+    parts = [part for part in CONES.parts if part.has_contours]
+    assert [piece.segment for piece in BODY.pieces] == [part.segment for part in parts]
+    for part, piece in zip(parts, BODY.pieces, strict=True):
         h = part.shape[2]
         middle = part.T_body_part @ [0, 0, 0.5 * h if part.kind == CONE else 0.0, 1]
         np.testing.assert_allclose(

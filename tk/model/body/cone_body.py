@@ -62,6 +62,7 @@ class ConePart:
     # centred on the origin
     T_body_part: Float
     ends: tuple[bool, bool] = (False, False)  # whether the rims at z = 0 and z = h are contours, too
+    has_contours: bool = True  # False: it is drawn and hides others, but its outline is compared with no edge
 
     @property
     def component(self) -> str:
@@ -109,6 +110,8 @@ class ConeBody:
         segments, inside = self.frames
         curves: list[tuple[int, int]] = []
         for p, part in enumerate(self.parts):
+            if not part.has_contours:
+                continue
             sides = (SIDE_A, SIDE_B) if part.kind == CONE else (OUTLINE,)
             rims = [rim for rim, tracked in zip((END_NEAR, END_FAR), part.ends, strict=True) if tracked]
             curves += [(p, kind) for kind in (*sides, *rims)]
@@ -237,21 +240,23 @@ class _Part(NamedTuple):
     shape: Float  # (N, 4)
     T_body_part: Float  # (N, 4, 4)
     ends: tuple[bool, bool] = (False, False)
+    has_contours: bool = True
 
 
 def build_cone_body(dimensions: BodyDimensions, up: str = "z") -> ConeBody:
     """Build the cone body of these dimensions.
 
     The torso consists of four frusta, the calf of two; the head has a neck, the foot an instep ("variable resolution",
-    silhouette paper, section 3).
+    silhouette paper, section 3). Between the frusta of thigh and calf, which end in discs, a ball fills the front of a
+    bent knee. It has no contours: those of a straight leg would be compared twice, and move the knee along the leg.
 
     Args:
         dimensions: lengths and radii, metres.
         up: the world axis that points up.
     """
     parts = tuple(
-        ConePart(name, segment, kind, tuple(shape[0].tolist()), T[0], ends)
-        for name, segment, kind, shape, T, ends in _parts(BodyDimensions.of(dimensions.values[None]))
+        ConePart(name, segment, kind, tuple(shape[0].tolist()), T[0], ends, has_contours)
+        for name, segment, kind, shape, T, ends, has_contours in _parts(BodyDimensions.of(dimensions.values[None]))
     )
     return ConeBody(dimensions, build_skeleton(dimensions, up), parts)
 
@@ -285,6 +290,8 @@ def _parts(d: BodyDimensions) -> list[_Part]:
         hollow = knee - KNEE_BACK * d.stature * x
         low = ankle + ANKLE_OUTWARD * d.stature * (M @ y)
         parts.append(_between(f"thigh_{side}", f"thigh_{side}", top, hollow, d.thigh_radius, d.knee_radius))
+        ball = _shape(d.knee_radius, d.knee_radius, d.knee_radius, 1.0)
+        parts.append(_Part(f"knee_{side}", f"thigh_{side}", ELLIPSOID, ball, _frame(hollow, -z, x), has_contours=False))
         parts += _calf(side, hollow, low, d) + _foot(side, ankle, d)
     return parts
 

@@ -58,11 +58,11 @@ def restore_body(model: Mapping[str, Any], up: str = "z") -> ConeBody:
         np.isfinite(shapes).all() and np.isfinite(places).all()
     ):
         raise ValueError("the parts have the wrong number, shape or values")
-    ends = {part.name: part.ends for part in body.parts}
+    drawn = {part.name: (part.ends, part.has_contours) for part in body.parts}
     return replace(
         body,
         parts=tuple(
-            ConePart(str(name), segment, int(kind), tuple(shape), T, ends.get(str(name), (False, False)))
+            ConePart(str(name), segment, int(kind), tuple(shape), T, *drawn.get(str(name), ()))
             for name, segment, kind, shape, T in zip(names, segments, kinds, shapes.tolist(), places, strict=True)
         ),
     )

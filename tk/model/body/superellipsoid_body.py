@@ -71,7 +71,7 @@ def build_superellipsoid_body(body: ConeBody, up: str = "z", spacing_m: float = 
         spacing_m: distance between neighbouring surface samples.
     """
     skeleton = build_skeleton(body.dimensions, up, paper=True)
-    pieces = tuple(piece_of(part) for part in body.parts)
+    pieces = tuple(piece_of(part) for part in body.parts if part.has_contours)  # others are inside, or nearly
     points, normals = [], []
     for piece in pieces:
         eta, omega = piece.samples(spacing_m)
