@@ -135,7 +135,7 @@ def in_order_of_names(cameras: Sequence[CameraNames], stems: Sequence[str]) -> l
 
 def natural(text: str) -> list[tuple[int, str]]:
     """Return a key that sorts numbers in names by value: cam2 before cam10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", text) if part]
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", text) if part]
 
 
 def _equal(camera: CameraNames, stems: Sequence[str]) -> str | None:
