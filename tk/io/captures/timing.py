@@ -89,7 +89,7 @@ def read_stamps(
     Raises:
         CaptureError: a file of time stamps is missing, cannot be read, or does not fit its clip.
     """
-    files = {path.stem: path for path in sorted(folder.glob("timestamps/*.csv"))}
+    files = {path.stem: path for path in sorted(folder.glob("timestamps/[!.]*.csv"))}
     if not files:
         return tuple(_of_container(clip, regular) for clip in clips)
     found = []
