@@ -112,8 +112,8 @@ def match_clips(cameras: Sequence[CameraNames], stems: Sequence[str]) -> Sequenc
 
     The first rule that matches most cameras counts, and no rule may match two cameras with one clip: equal names; one
     name within the other ("cam01" in "int_cam01_img"); the number in which the names differ ("cam_0", "port_0"); the
-    names without their common beginning and end ("A", "trial1-camA"). Of as many clips as cameras, all must match: "cam1"
-    to "cam4" and "cam0" to "cam3" may be the same cameras.
+    names without their common beginning and end ("A", "trial1-camA"). Of as many clips as cameras, all must match:
+    "cam1" to "cam4" and "cam0" to "cam3" may be the same cameras.
     """
     best, most = None, 1
     for found in (
