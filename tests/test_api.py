@@ -53,6 +53,9 @@ def test_frames_that_are_none_are_refused(tiny: Path, frames: Any) -> None:
 def test_arguments_of_other_types_are_accepted_or_refused_in_one_line(tiny: Path) -> None:
     assert tk.open_capture(tiny, "cam1, cam3").rig.names == ("cam1", "cam3")
     tk.track(tiny, frames=(np.int64(0), np.int64(3)))  # begins when the first estimate is asked for
+    tk.track(tiny, people=0)
+    with pytest.raises(ConfigError, match="give auto, all, or different numbers"):
+        tk.track(tiny, people=0.5)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="has no method segment"):
         tk.track(tiny, segmenter=lambda image: image)  # type: ignore[arg-type]
 

@@ -10,6 +10,8 @@ from operator import index
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict, overload
 
+import numpy as np
+
 from tk.errors import ConfigError
 from tk.io.captures.capture import Capture
 from tk.io.captures.source import Source
@@ -70,7 +72,7 @@ class _Options(TypedDict, total=False):
     seed: int | None
     init_pose: PathLike | None
     body: PathLike | None
-    people: str | Sequence[int]
+    people: str | int | Sequence[int]
     segmenter: Segmenter | None
     causal: bool
     resume: bool
@@ -98,7 +100,7 @@ def track(
     seed: int | None = None,
     init_pose: PathLike | None = None,
     body: PathLike | None = None,
-    people: str | Sequence[int] = "auto",
+    people: str | int | Sequence[int] = "auto",
     segmenter: Segmenter | None = None,
     causal: bool = False,
     resume: bool = False,
@@ -147,7 +149,7 @@ def track(
         settings,
         method,
         frames,
-        parse_choice(people if isinstance(people, str) else ",".join(map(str, people))),
+        parse_choice(people if isinstance(people, str) else ",".join(map(str, np.ravel(people)))),
         causal,
         init_pose=Path(init_pose) if init_pose is not None else None,
         body=Path(body) if body is not None else None,

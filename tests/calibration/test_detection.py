@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from scripts.synthetic.boards import texture
 from tests.calibration.rigs import footages
 from tests.conftest import Tk
+from tests.io.conftest import write_video
 from tk.calibration.boards import Board, make_board
 from tk.calibration.detection import detect
-from tk.calibration.footage import Footage, choose
+from tk.calibration.footage import Footage, choose, read_footage
 from tk.calibration.misses import explain_miss
 from tk.calibration.poses import exp
 
@@ -130,6 +131,15 @@ def test_chosen_instants_are_sharp_and_different() -> None:
     assert not {200, 201, 202} & set(choose(recorded, 200)[0])
 
 
+def test_videos_that_differ_by_a_frame_are_searched_at_the_same_instants(tmp_path: Path) -> None:
+    for name, count in (("a", 480), ("b", 481)):
+        (tmp_path / name).mkdir()
+        write_video(tmp_path / name / f"{name}.avi", np.zeros((count, 48, 64, 3), np.uint8))
+        (tmp_path / name / f"._{name}.avi").write_bytes(b"of macOS")
+    a, b = read_footage(tmp_path, CHARUCO, None, lambda _: None)
+    assert a.instants == b.instants[: len(a.instants)] and len(b.instants) - len(a.instants) <= 1
+
+
 @pytest.mark.parametrize("kind", SQUARES)
 def test_sheet_has_the_board_in_its_size(tk: Tk, tmp_path: Path, kind: str) -> None:
     path = tmp_path / "board.pdf"
@@ -142,6 +152,7 @@ def test_sheet_has_the_board_in_its_size(tk: Tk, tmp_path: Path, kind: str) -> N
         widths = {float(line.split()[2]) for line in re.findall(r"[\d.]+ [\d.]+ [\d.]+ [\d.]+ re", text)[:20]}
         assert len(widths) == 1 and abs(widths.pop() - 1000 * square_m * 72 / 25.4) < 1e-3
     tk("calibrate", "--print", path, "--board", kind).complaint("board.pdf", "--force")
+    tk("calibrate", "--print", path, "--board", kind, "--square", "0", "--force").complaint("--square 0")
     place = int(text.split("startxref\n")[1].split()[0])
     assert text[place:].startswith("xref")
 

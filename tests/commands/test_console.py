@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import logging
 import re
@@ -11,6 +12,7 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
+from tk.commands.base import errors_in_one_line
 from tk.commands.console import ConsoleReporter
 
 
@@ -111,3 +113,11 @@ def test_long_stage_shows_that_it_goes_on(capfd: pytest.CaptureFixture[str], mon
     lines = capfd.readouterr().err.splitlines()
     assert len(lines) >= 2 and lines[0].endswith("] compiling")
     assert all(line.endswith("] still compiling") for line in lines[1:])
+
+
+def test_folder_that_must_not_be_read_ends_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended, errors_in_one_line():
+        raise PermissionError(errno.EACCES, "Permission denied", "locked")
+    assert ended.value.code == 2 and capsys.readouterr().err == "tk: locked: Permission denied\n"
+    with pytest.raises(PermissionError), errors_in_one_line():  # of no path
+        raise PermissionError(errno.EPERM, "Operation not permitted")

@@ -276,6 +276,8 @@ def test_level_writes_up_and_keeps_the_rest(tk: Tk, copy: Path) -> None:
         "",
         'up = "y"\n',
         "up = [0.0,\n  1.0, # rows\n  0.0]  # old\nfps = 3.0\n",
+        'fps = 3.0\r\nup = "y"\r\n[init]\r\nframe = 0\r\n',
+        'up = "y"  # of Windows\r\nfps = 3.0\r\n',
         "fps = 3.0\n[volume]\ncenter = [\n 0.0, 0.0, 1.0\n]\nsize = [2.0, 2.0, 2.0]\n",
         "[subject]\nheight = 1.8",
     ],
@@ -285,7 +287,7 @@ def test_up_is_written_before_the_first_table(tmp_path: Path, text: str, up: str
     from tk.io.toml import load_toml
 
     path = tmp_path / "capture.toml"
-    path.write_text(text)
+    path.write_text(text, newline="")
     before = load_toml(path)
     write_up(tmp_path, Leveling(up, "how", 0.0, ""))
     after = load_toml(path)

@@ -20,8 +20,11 @@ from tests.synchronise.scenes import ring, wander, watch
 from tests.synchronise.test_sound import steps
 from tk.cli import main
 from tk.io.captures.calibration import camera_table
+from tk.io.captures.capture import open_capture
+from tk.io.importers.videos import natural
 from tk.io.toml import load_toml
 from tk.synchronise.looks import Look
+from tk.synchronise.raw import list_files
 from tk.synchronise.sound import RATE
 
 NAMES = ("a", "b", "c")
@@ -96,7 +99,8 @@ def test_raw_folder_becomes_a_capture(copy: Path) -> None:
     assert found["b"]["sigma_s"] < 0.02 and "known cameras" in found["b"]["method"]
     document = load_toml(capture / "capture.toml")
     assert (capture / document["videos"]["b"]["path"]).resolve() == copy / "b.mp4"
-    assert document["from"] == pytest.approx(2.2, abs=0.01) and document["fps"] == 20.0
+    assert document["from"] == pytest.approx(2.2, abs=0.01) and "fps" not in document
+    assert json.loads(result.stdout)["fps"] == open_capture(capture).fps == 20.0
     assert sorted(path.name for path in capture.iterdir()) == ["calibration.toml", "capture.toml", "sync.png"]
 
 
@@ -109,6 +113,52 @@ def test_second_run_does_not_replace_a_capture(copy: Path) -> None:
     assert run(copy, *offsets, "--force", "--from", "3")[0].exit_code == 0
     document = load_toml(capture / "capture.toml")
     assert document["subject"]["height"] == 1.7 and document["from"] == 3.0
+
+
+def test_rate_of_millisecond_time_stamps_is_that_of_the_camera(copy: Path) -> None:
+    calibrate(copy)
+    for c, name in enumerate(NAMES):
+        (copy / f"{name}.mp4").unlink()
+        own = np.arange(120) / 30
+        write(copy / f"{name}.mkv", Look(own, watch(ring(3)[c], [], 0.0, 4.0, 30.0, c).greys))
+    result, capture = run(copy, "--offsets", "a=0,b=0,c=0", "--json")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["fps"] == open_capture(capture).fps == 30.0
+
+
+def test_rate_that_is_given_is_written_and_one_of_an_earlier_run_is_not_kept(copy: Path) -> None:
+    assert run(copy, *HAND, "--fps", "10")[0].exit_code == 0
+    capture = copy.parent / "CAPTURE"
+    assert load_toml(capture / "capture.toml")["fps"] == 10.0
+    assert run(copy, *HAND, "--force")[0].exit_code == 0
+    assert "fps" not in load_toml(capture / "capture.toml")
+
+
+def test_from_is_in_seconds_of_the_first_video_whatever_its_offset(copy: Path) -> None:
+    result, capture = run(copy, "--offsets", "a=100,b=102.2,c=101", "--from", "3")
+    assert result.exit_code == 0, result.output
+    document = load_toml(capture / "capture.toml")
+    assert document["from"] == 3.0
+    assert [document["videos"][name]["offset"] for name in NAMES] == pytest.approx([0, 2.2, 1])
+
+
+def test_capture_with_a_background_gets_no_second_empty_scene(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tk.synchronise.text.find_empty", lambda looks, clocks: (2.5, 4.5))
+    (copy.parent / "CAPTURE" / "background").mkdir(parents=True)
+    result, capture = run(copy, *HAND)
+    assert result.exit_code == 0 and "empty scene: in background/" in result.output, result.output
+    assert "background" not in load_toml(capture / "capture.toml")
+    result, _ = run(copy, *HAND, "--force", "--empty", "3:4")
+    assert result.exit_code == 2 and "has background/ of its own" in result.stderr
+
+
+def test_folder_that_is_named_as_a_video_is_no_video(copy: Path) -> None:
+    (copy / "d.mp4").mkdir()
+    assert list(list_files(copy)) == list(NAMES)
+
+
+def test_digits_that_are_no_number_are_text() -> None:
+    assert sorted(["10", "²", "2"], key=natural) == ["²", "2", "10"]
 
 
 def test_another_calibration_in_the_capture_is_replaced_only_if_asked_for(copy: Path) -> None:
@@ -227,6 +277,7 @@ FAULTS: dict[str, tuple[Callable[[Path], object], tuple[str, ...], str]] = {
     "camera without offset": (lambda _: None, ("--offsets", "a=0,b=2"), "camera c is missing"),
     "same file twice": (lambda f: shutil.copy(f / "a.mp4", f / "b.mp4"), (), "b.mp4: is the same file as"),
     "same name twice": (lambda f: shutil.copy(f / "a.mp4", f / "a.mov"), (), "another file has the same name"),
+    "link to nothing": (lambda f: (f / "d.mp4").symlink_to(f / "gone.mp4"), (), "d.mp4"),
     "missing chapter": (chapter_gap, (), "GX030012.MP4: chapter 2 of this recording is missing"),
     "chapters out of order": (
         lambda f: chapters(f, "10:20:00", "10:00:00"), (), "CLIP1.MP4: camera b: was recorded 1200 s before CLIP0.MP4",

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from tests.synchronise.scenes import ring, wander, watch
+from tk.synchronise.decide import timecode_ties
+from tk.synchronise.raw import Recording
 from tk.synchronise.ties import KNOWN_RATE, Tie, solve
 from tk.synchronise.travel import SOUND_M_S, without_travel_time
 
@@ -51,6 +55,16 @@ def test_camera_without_ties_is_not_connected() -> None:
 def test_sigma_of_sound_holds_the_way_of_the_sound_and_the_device() -> None:
     sound, flash = solve(4, ties(kind="sound")), solve(4, ties(kind="flash"))
     assert sound.offset_sigma_s[1] > 0.01 > flash.offset_sigma_s[1]
+
+
+def test_timecode_passes_midnight() -> None:
+    codes = (86399.5, 0.7)
+    both = [
+        Recording(f"cam{c}", (Path("v"),), (0.0,), np.arange(50) / 25, 64, 48, timecode_s=code)
+        for c, code in enumerate(codes)
+    ]
+    (tie,) = timecode_ties(both)
+    assert tie.own_i - tie.own_j == pytest.approx(1.2)
 
 
 def test_skew_between_sound_and_pictures_does_not_move_the_clocks() -> None:

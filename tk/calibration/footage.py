@@ -26,7 +26,7 @@ from tk.io.captures.video import VIDEO_SUFFIXES, probe_video
 Float = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 
-#: most images of a video that are searched for the board; more take longer and look alike
+#: most images of the longest video that are searched for the board; more take longer and look alike
 _LOOKS = 240
 #: a view less sharp than this share of the camera's sharp ones (upper quartile) is blurred: its corners are off by more
 #: than the noise
@@ -94,21 +94,23 @@ def list_cameras(folder: Path, note: Callable[[str], None]) -> dict[str, Path | 
             clips = list_clips(folder / inner)
             if clips:
                 return dict(clips)
-    clips = {name: path for name, path in list_clips(folder).items() if not path.is_dir() or _holds_images(path)}
+    suffixes = PICTURE_SUFFIXES + VIDEO_SUFFIXES
+    clips = {name: path for name, path in list_clips(folder).items() if not path.is_dir() or _files(path, suffixes)}
     if not clips:
         raise CalibrationError(f"{folder}: holds no cameras; it needs a folder of pictures or a video for each camera")
     return {name: _inside(path) for name, path in clips.items()}
 
 
-def _holds_images(folder: Path) -> bool:
-    return any(file.suffix.lower() in PICTURE_SUFFIXES + VIDEO_SUFFIXES for file in folder.iterdir())
+def _files(folder: Path, suffixes: Sequence[str]) -> list[Path]:
+    """Return the files in a folder with these suffixes, without hidden ones, such as those that macOS adds."""
+    return [path for path in sorted(folder.iterdir()) if path.suffix.lower() in suffixes and path.name[0] != "."]
 
 
 def _inside(path: Path) -> Path:
     """Return the one video in a camera's folder, if there is one; else the path."""
     if not path.is_dir():
         return path
-    videos = [file for file in sorted(path.iterdir()) if file.suffix.lower() in VIDEO_SUFFIXES]
+    videos = _files(path, VIDEO_SUFFIXES)
     if len(videos) > 1:
         raise CalibrationError(f"{path}: holds {len(videos)} videos; keep the one that shows the board")
     return videos[0] if videos else path
@@ -134,22 +136,24 @@ def read_footage(
     for name, given in known.items():
         if cameras is None or name in cameras:
             path = given if isinstance(given, Path) else given.path
-            progress(f"searching for the board in {path}")
             clip = given if isinstance(given, Clip) else None if path.is_dir() else probe_video(path)
-            footage = Footage(name, path, clip=clip)
-            for instant, grey, following in _images(footage):
-                _look(footage, board, instant, grey, following)
-            found.append(footage)
+            found.append(Footage(name, path, clip=clip))
+    longest = max((footage.clip.frame_count for footage in found if footage.clip), default=0)
+    step = max(1, -(-longest // _LOOKS))  # of all cameras, so that their instants are the same
+    for footage in found:
+        progress(f"searching for the board in {footage.path}")
+        for instant, grey, following in _images(footage, step):
+            _look(footage, board, instant, grey, following)
     return found
 
 
-def _images(footage: Footage) -> Iterator[tuple[int, Grey, Grey | None]]:
-    """Yield the instants and grey images of a camera, and the frame after each if it is a video."""
+def _images(footage: Footage, step: int) -> Iterator[tuple[int, Grey, Grey | None]]:
+    """Yield the instants and grey images of a camera, and the frame after each if it is a video, of which one of
+    ``step`` frames is an instant."""
     clip = footage.clip
     if clip is None:
-        files = [file for file in sorted(footage.path.iterdir()) if _is_picture(file)]
         numbers: dict[int, Path] = {}
-        for file in files:
+        for file in _files(footage.path, PICTURE_SUFFIXES):
             number = picture_number(file)
             if number is None:
                 raise CalibrationError(f"{file}: its name has no number; pictures of one instant have the same number")
@@ -166,7 +170,6 @@ def _images(footage: Footage) -> Iterator[tuple[int, Grey, Grey | None]]:
             yield number, picture, None
         return
     footage.width, footage.height = clip.width, clip.height
-    step = max(1, -(-clip.frame_count // _LOOKS))
     wanted = np.array([k for k in range(clip.frame_count) if k % step <= 1])
     blank = (clip.shown(wanted) < 0).tolist()
     waiting: tuple[int, Grey] | None = None  # for the frame that follows
@@ -186,10 +189,6 @@ def _images(footage: Footage) -> Iterator[tuple[int, Grey, Grey | None]]:
 
 def _grey(picture: NDArray[Any]) -> Grey:
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8)
-
-
-def _is_picture(file: Path) -> bool:
-    return file.suffix.lower() in PICTURE_SUFFIXES and not file.name.startswith(".")
 
 
 def _look(footage: Footage, board: Board, instant: int, grey: Grey, following: Grey | None) -> None:

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from tk.settings import Settings
 
 
-#: errors of the system about a path that no file can have; the first use of such a path fails
-_IMPOSSIBLE_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
+#: errors of the system about a path that no file can have, or that this user may not use; its first use fails
+_UNUSABLE = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM)
 #: characters of such a path that a message shows
 _SHOWN = 100
 
@@ -46,7 +46,7 @@ def errors_in_one_line() -> Iterator[None]:
     except TkError as error:
         exit_with(error.exit_code, error.line)
     except OSError as error:
-        if error.errno not in _IMPOSSIBLE_NAMES:
+        if error.errno not in _UNUSABLE or error.filename is None:
             raise
         exit_with(2, f"{str(error.filename)[:_SHOWN]}: {error.strerror}")
     except KeyboardInterrupt as reason:

@@ -115,7 +115,9 @@ def _print(given: dict[str, Any]) -> None:
 
     kind = (given["board"], given["size"])
     marks = (given["marker"], given["dictionary"])
-    square = given["square"] or fitted_square_m(*kind, given["paper"], *marks)
+    square = given["square"]
+    if square is None:
+        square = fitted_square_m(*kind, given["paper"], *marks)
     board = make_board(*kind, square, *marks)
     write_sheet(given["sheet"], board, given["paper"], given["force"])
     click.echo(

@@ -90,6 +90,9 @@ def sync(raw: Path, output: Path, **given: Any) -> None:
         if None not in (given["begin"], given["end"]) and given["begin"] >= given["end"]:
             raise ConfigError(f"--from {given['begin']:g} --to {given['end']:g}: ends before it begins")
         check_capture(output, raw, given["force"])
+        empty_known = (output / "background").is_dir()
+        if empty_known and given["empty"]:
+            raise ConfigError(f"--empty: {output} has background/ of its own; remove one of them")
         recordings = read_raw(raw, given["cameras"])
         calibration, cameras = read_cameras(raw, recordings)
         with one_thread():
@@ -103,17 +106,22 @@ def sync(raw: Path, output: Path, **given: Any) -> None:
             for line in done.decision.notes:
                 reporter.note(line)
             span = chosen_span(done, given["begin"], given["end"])
-            empty = empty_part(done, given["empty"])
+            empty = None if empty_known else empty_part(done, given["empty"])
             span = without_empty(span, empty, given["begin"], given["end"])
-        fps = fps or min(1 / recording.interval_s for recording in recordings)
         write_capture(output, recordings, done.clocks, fps, span, empty, calibration)
         write_sheet(output / "sync.png", recordings, done.clocks, fastest_instants(done.looks, done.clocks, span))
+    fps = fps or done.fps
     if given["as_json"]:
         base.print_json(**to_dict(done), **{"from": span[0], "to": span[1]}, fps=fps, empty=empty)
     else:
         click.echo(table(done))
-        scene = "empty scene: none found" if empty is None else f"empty scene: {empty[0]:.2f} s to {empty[1]:.2f} s"
-        click.echo(f"capture: {span[0]:.2f} s to {span[1]:.2f} s of {recordings[0].name}, {fps:.5g} frames/s; {scene}")
+        scene = "in background/" if empty_known else "none found"
+        if empty is not None:
+            scene = f"{empty[0]:.2f} s to {empty[1]:.2f} s"
+        click.echo(
+            f"capture: {span[0]:.2f} s to {span[1]:.2f} s of {recordings[0].name}, {fps:.5g} frames/s; "
+            f"empty scene: {scene}"
+        )
     click.echo(f"wrote {output / 'capture.toml'} and {output / 'sync.png'}: look at it", err=True)
 
 

@@ -37,7 +37,9 @@ SAME_DEG = 10.0
 #: percentile of the voxels' heights that is the floor; lower voxels come from specks in the masks
 _FLOOR_PERCENTILE = 0.5
 
-_UP = re.compile(r"^[ \t]*(up|\"up\"|'up')[ \t]*=[ \t]*(\[[^\]]*\]|\"[^\"\n]*\"|'[^'\n]*')[ \t]*(#[^\n]*)?$", re.M)
+_UP = re.compile(
+    r"^[ \t]*(up|\"up\"|'up')[ \t]*=[ \t]*(\[[^\]]*\]|\"[^\"\n]*\"|'[^'\n]*')[ \t]*(#[^\r\n]*)?(?=\r?$)", re.M
+)
 
 
 @dataclass(frozen=True)
@@ -153,4 +155,4 @@ def write_up(capture: Path, leveling: Leveling) -> None:
     if parse_toml(new, str(path)) != {**before, **parse_toml(line, str(path))}:
         raise CaptureError(f"{path}: cannot be changed automatically; add {line!r} yourself")
     with replacing(path, CaptureError) as part:
-        part.write_text(new, encoding="utf-8")
+        part.write_text(new, encoding="utf-8", newline="")

@@ -12,7 +12,6 @@ import tomli_w
 
 from tk.errors import CaptureError, unwritable
 from tk.io.captures.calibration import Calibration
-from tk.io.captures.timing import nominal_rate
 from tk.io.paths import check_not_input, replacing
 from tk.io.toml import load_toml
 from tk.synchronise.raw import Recording
@@ -68,7 +67,7 @@ def write_capture(
     folder: Path,
     recordings: Sequence[Recording],
     clocks: Clocks,
-    fps: float,
+    fps: float | None,
     span: tuple[float, float],
     empty: tuple[float, float] | None,
     calibration: Calibration | None,
@@ -79,7 +78,7 @@ def write_capture(
         folder: the capture; made if it does not exist.
         recordings: the cameras.
         clocks: their clocks.
-        fps: rate of the capture, 1/s.
+        fps: rate of the capture, 1/s; None: that of the slowest camera.
         span: common time of the first frame and the end, seconds.
         empty: common time of the empty scene, seconds; None without one.
         calibration: of RAW; None without one.
@@ -89,12 +88,13 @@ def write_capture(
     """
     file = folder / "capture.toml"
     before = load_toml(file) if file.exists() else {}
+    for key in ("fps", "times", "background"):  # what they say, this run decides; own times are the files'
+        before.pop(key, None)
     document: dict[str, object] = {key: value for key, value in before.items() if not isinstance(value, dict)}
     unit = 10**_SPAN_DIGITS  # rounded inwards: the first and the last frame have images
     begin, end = math.ceil(span[0] * unit - 1e-6) / unit, math.floor(span[1] * unit + 1e-6) / unit
-    document |= {"fps": round(nominal_rate(fps), _RATE_DIGITS), "from": begin, "to": end}
+    document |= {"from": begin, "to": end} | ({} if fps is None else {"fps": fps})
     document |= {key: value for key, value in before.items() if isinstance(value, dict)}
-    document.pop("background", None)
     if empty is not None:
         document["background"] = {"from": round(empty[0], _SPAN_DIGITS), "to": round(empty[1], _SPAN_DIGITS)}
     document["videos"] = {

@@ -22,6 +22,8 @@ SHOWN = {"cameras": "motion, known cameras", "person": "motion"}
 SKEW_S = 0.04 + 0.003 * 10
 #: seconds above which sound and pictures are not of one recording
 _OTHER_S = 0.25
+#: seconds after which timecode begins again with 0
+_DAY_S = 86400.0
 
 
 @dataclass
@@ -119,7 +121,7 @@ def timecode_ties(recordings: Sequence[Recording]) -> list[Tie]:
     first = recordings[0]
     ties = []
     for c, (recording, code) in enumerate(zip(recordings[1:], known[1:], strict=True), 1):
-        ahead = code - known[0]  # the recording began so much later
+        ahead = (code - known[0] + _DAY_S / 2) % _DAY_S - _DAY_S / 2  # the recording began so much later
         sigma = max(first.interval_s, recording.interval_s)
         ties.append(Tie(0, c, first.times_s[0] + ahead, recording.times_s[0], sigma, "timecode"))
     return ties

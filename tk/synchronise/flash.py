@@ -15,6 +15,7 @@ from itertools import combinations, groupby
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.io.captures.timing import image_interval
 from tk.synchronise.looks import Look
 from tk.synchronise.ties import Tie, connected_to
 
@@ -105,7 +106,7 @@ def _event(look: Look, first: int, last: int, common: float) -> Event | None:
     partly = (lit * (1 - lit)).argmax()  # the image that saw most of the change
     own = float(times[partly]) if last > first else float(times.mean())
     sigma = float(np.hypot(_SHARE_SIGMA, common / change))
-    return Event(own, float(np.median(np.diff(look.times_s))), change, times, lit, sigma)
+    return Event(own, image_interval(look.times_s), change, times, lit, sigma)
 
 
 def compare_events(looks: Sequence[Look]) -> list[Tie]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError, ClockError
 from tk.io.captures.calibration import Calibration, match_camera, read_calibration
 from tk.io.captures.packets import open_video
+from tk.io.captures.timing import chapter_shifts, image_interval
 from tk.io.captures.video import VIDEO_SUFFIXES, probe_video
 from tk.io.importers.videos import natural
 from tk.model.cameras.camera import Camera
@@ -60,8 +61,8 @@ class Recording:
 
     @property
     def interval_s(self) -> float:
-        """Median interval of the images, seconds."""
-        return float(np.median(np.diff(self.times_s)))
+        """Interval of the images, seconds."""
+        return image_interval(self.times_s)
 
     @property
     def span(self) -> tuple[float, float]:
@@ -101,9 +102,10 @@ def read_raw(folder: Path, cameras: Sequence[str] | None = None) -> list[Recordi
     chosen = {name: paths for name, paths in found.items() if cameras is None or name in cameras}
     if len(chosen) < 2:
         raise CaptureError(f"{folder}: holds one camera, {next(iter(chosen))}; tk sync needs the videos of two or more")
-    _check_different([path for paths in chosen.values() for path in paths])
     with ThreadPoolExecutor(2) as threads:
-        return list(threads.map(lambda item: _read(*item), chosen.items()))
+        recordings = list(threads.map(lambda item: _read(*item), chosen.items()))
+    _check_different([path for recording in recordings for path in recording.paths])
+    return recordings
 
 
 def _check_different(files: Sequence[Path]) -> None:
@@ -180,8 +182,8 @@ def read_cameras(folder: Path, recordings: Sequence[Recording]) -> tuple[Calibra
 
 
 def _videos(folder: Path) -> list[Path]:
-    files = [path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES and path.name[0] != "."]
-    return sorted(files, key=lambda file: natural(file.name.lower()))
+    named = [path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES and path.name[0] != "."]
+    return sorted((path for path in named if not path.is_dir()), key=lambda file: natural(file.name.lower()))
 
 
 def _recordings(files: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
@@ -200,8 +202,7 @@ def _recordings(files: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
 
 
 def _read(name: str, paths: tuple[Path, ...]) -> Recording:
-    times: list[Float] = []
-    shifts: list[float] = []
+    files: list[Float] = []
     first = None
     for path in paths:
         clip = probe_video(path)
@@ -212,14 +213,13 @@ def _read(name: str, paths: tuple[Path, ...]) -> Recording:
             raise CaptureError(
                 f"{path}: is {clip.width}×{clip.height}; the chapter before it is {first.width}×{first.height}"
             )
-        shift = float(times[-1][-1] + np.median(np.diff(times[-1])) - clip.times_s[0]) if times else 0.0
-        shifts.append(shift)
-        times.append(clip.times_s + shift)
+        files.append(clip.times_s)
     assert first is not None
-    every = np.concatenate(times)
-    marks = [_marks(path, float(np.median(np.diff(every)))) for path in paths]
+    shifts = chapter_shifts(files)
+    every = np.concatenate([own + shift for own, shift in zip(files, shifts, strict=True)])
+    marks = [_marks(path, image_interval(every)) for path in paths]
     created, timecode = marks[0]
-    _check_order(name, paths, [mark[0] for mark in marks], [float(own[-1] - own[0]) for own in times])
+    _check_order(name, paths, [mark[0] for mark in marks], [float(own[-1] - own[0]) for own in files])
     recording = Recording(
         name, paths, tuple(shifts), every, first.width, first.height, first.turn, created, timecode
     )  # fmt: skip

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError, VideoError
+from tk.io.captures.timing import Stamps, slowest_rate
 from tk.model.cameras.camera import Camera
 from tk.synchronise.decide import Decision, decide, timecode_ties
 from tk.synchronise.faults import (
@@ -55,6 +56,18 @@ class Synchronised:
     def clocks(self) -> Clocks:
         """The clocks of all cameras."""
         return self.decision.clocks
+
+    @property
+    def fps(self) -> float:
+        """Rate of the slowest camera, 1/s: that of the capture if `capture.toml` has none."""
+        return slowest_rate(
+            [
+                Stamps(recording.paths[0], offset_s + rate * recording.times_s, common=True)
+                for recording, offset_s, rate in zip(
+                    self.recordings, self.clocks.offsets_s, self.clocks.rates, strict=True
+                )
+            ]
+        )
 
 
 def synchronise(
@@ -146,7 +159,8 @@ def synchronise(
 
 
 def by_hand(recordings: list[Recording], offsets_s: dict[str, float], begin_s: float | None) -> Synchronised:
-    """Return the clocks of offsets, seconds, that the user gives for every camera.
+    """Return the clocks of offsets, seconds, that the user gives for every camera; the common time is that of the
+    first one.
 
     Raises:
         CaptureError: a camera is unknown or missing.
@@ -160,10 +174,10 @@ def by_hand(recordings: list[Recording], offsets_s: dict[str, float], begin_s: f
             raise CaptureError(f"--offsets: camera {name} is missing; give one for each of {', '.join(names)}")
     count = len(names)
     nan = np.full(count, np.nan)
-    offsets = np.array([offsets_s[name] for name in names])
+    offsets = np.array([offsets_s[name] - offsets_s[names[0]] for name in names])
     clocks = Clocks(offsets, np.ones(count), nan, nan)
     decision = Decision(clocks, ["by hand"] * count)
-    ties = [Tie(0, c, offsets[c] - offsets[0], 0.0, 1.0, "hand") for c in range(1, count)]
+    ties = [Tie(0, c, offsets[c], 0.0, 1.0, "hand") for c in range(1, count)]
     return Synchronised(recordings, decision, _look(recordings, ties, begin_s, str))
 
 

@@ -204,6 +204,12 @@ def test_match_camera(name: str, key: str, stems: list[str], expected: str | Non
     assert match_camera(name, key, stems) == expected
 
 
+def test_match_camera_ignores_how_accents_are_written() -> None:
+    composed, separated = "camara\u00e9", "camarae\u0301"
+    assert match_camera(composed, "1", [separated]) == separated
+    assert match_camera(separated, "1", [composed]) == composed
+
+
 def test_match_camera_refuses_to_guess() -> None:
     with pytest.raises(CaptureError, match="could be any of cam-01, cam01"):
         match_camera("cam_01", "cam_01", ["cam01", "cam-01"])

@@ -18,6 +18,7 @@ from tests.conftest import QUICK, Tk, refused, track, without_first_pose
 from tk.errors import CaptureError
 from tk.io import settings_file
 from tk.io.captures.capture import Capture, open_capture
+from tk.io.captures.clock import Resampled
 from tk.io.captures.keypoints import LAYOUTS, keypoint_pose, read_people
 from tk.io.results.reader import read_joints, read_result
 from tk.model.body.skeleton import JOINTS
@@ -105,6 +106,23 @@ def test_keypoints_follow_time_offsets(detected: Path, capture: Capture, tmp_pat
     assert keypoint_pose(folder, late, FRAME).joints.keys() == keypoint_pose(detected, capture, FRAME).joints.keys()
     with pytest.raises(CaptureError, match="has no keypoints of picture 4"):
         keypoint_pose(folder, capture, FRAME)
+
+
+def test_keypoints_are_those_of_the_image_that_a_frame_on_a_clock_shows(detected: Path, capture: Capture) -> None:
+    pictures = [FRAME, FRAME, -1]
+    clocked = replace(capture, clips=tuple(Resampled.of(clip, np.array(pictures)) for clip in capture.clips))
+    np.testing.assert_equal(keypoint_pose(detected, clocked, 0).joints, keypoint_pose(detected, capture, FRAME).joints)
+    with pytest.raises(CaptureError, match="has no image near frame 2"):
+        keypoint_pose(detected, clocked, 2)
+
+
+def test_hidden_files_beside_keypoints_are_ignored(detected: Path, capture: Capture, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(detected, tmp_path / "pose"))
+    for file in list(folder.rglob("*.json")):
+        file.with_name(f"._{file.name}").write_bytes(b"of macOS")
+    np.testing.assert_equal(
+        keypoint_pose(folder, capture, FRAME).joints, keypoint_pose(detected, capture, FRAME).joints
+    )
 
 
 def person(**changes: Any) -> dict[str, Any]:

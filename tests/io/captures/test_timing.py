@@ -15,6 +15,7 @@ from tests.conftest import refused
 from tests.io.conftest import MakeCapture, picture, read_tag, write_toml, write_video
 from tk.errors import CaptureError, ClockError
 from tk.io.captures.capture import Capture, open_capture
+from tk.io.captures.timing import chapter_shifts
 
 VOLUME = {"center": [0.0, 0.0, 1.0], "size": [1.0, 1.0, 1.0]}
 
@@ -230,3 +231,8 @@ def test_images_without_times_cannot_be_resampled(make_capture: MakeCapture) -> 
         open_capture(folder, resample=True)
     write_times(folder, cam1=[0, 1, 2, 3], cam2=[0, 1, 2, 3], cam3=[0, 1, 2, 3])
     assert open_capture(folder).fps == 1
+
+
+def test_chapter_begins_one_interval_of_the_one_before_after_its_end() -> None:
+    slow, fast = np.arange(5) / 10, np.arange(5) / 100
+    assert chapter_shifts([slow, fast, slow]) == pytest.approx([0, 0.5, 0.55])

@@ -343,6 +343,33 @@ def test_opencv_stereo(folder: Path) -> None:
         np.testing.assert_allclose(camera.project(X)[0], true.project(X)[0], atol=EXACT_PX, rtol=0)
 
 
+def test_opencv_coefficients_with_numbers_are_no_pair(folder: Path, check: Import) -> None:
+    rig = make_rig()
+    for camera in rig:
+        values = opencv_values(camera)
+        text = storage_text(values, ".yml") + "k1: 0.1\nk2: 0.2\n"
+        (folder / f"{camera.name}.yml").write_text(text)
+    clips(folder)
+    check(folder, rig, tolerance_px=EXACT_PX)
+
+
+def test_opencv_names_of_digits_stay_as_they_are(folder: Path) -> None:
+    for number, camera in enumerate(make_rig()):
+        text = storage_text(opencv_values(camera), ".yml") + f'camera_name: "0012{number}"\n'
+        (folder / f"{camera.name}.yml").write_text(text)
+    clips(folder, ["00120", "00121", "00122", "00123"])
+    assert read_project(folder).rig.names == ("00120", "00121", "00122", "00123")
+
+
+def test_opencv_cameras_of_one_name_are_refused(folder: Path) -> None:
+    for camera in make_rig():
+        text = storage_text(opencv_values(camera), ".yml") + "camera_name: narrow_stereo\n"
+        (folder / f"{camera.name}.yml").write_text(text)
+    clips(folder)
+    with refused(CalibrationError, "two cameras have the name 'narrow_stereo'", folder):
+        read_project(folder)
+
+
 def test_opencv_intrinsics_alone_are_refused(folder: Path) -> None:
     for camera in make_rig():
         values = opencv_values(camera)

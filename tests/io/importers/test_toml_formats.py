@@ -24,7 +24,7 @@ from tests.io.importers.conftest import (
 from tests.io.importers.test_xml_formats import write_qca
 from tk.errors import CalibrationError, VideoError
 from tk.io.captures.capture import open_capture
-from tk.io.importers import import_project
+from tk.io.importers import Wanted, import_project
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.up import up_vector
 
@@ -207,6 +207,15 @@ def test_anipose_in_millimetres(folder: Path, check: Import, metadata: dict[str,
     write_clips(folder / "videos-raw", [f"trial1-cam{letter}" for letter in "ABCD"], suffix=".avi")
     checked = check(folder, rig)
     checked.note("lengths are in mm, as the file says" if metadata else "lengths are taken for mm")
+
+
+def test_delays_of_the_cameras_are_kept(folder: Path) -> None:
+    known = tables(make_rig())
+    known["cam2"]["time_offset"] = 0.05
+    write_toml(folder / "calibration.toml", known)
+    write_clips(folder / "videos-raw", CAMS)
+    imported = import_project(folder, folder.with_name("imported"), Wanted(unit="m"))
+    assert open_capture(imported.path).time_offset_s == (0.0, 0.05, 0.0, 0.0)
 
 
 def test_table_top_in_millimetres_or_room_in_centimetres_needs_a_unit(folder: Path, check: Import) -> None:

@@ -38,6 +38,7 @@ def test_names_are_matched(cameras: list[str], stems: list[str]) -> None:
         (["0", "1", "2", "3"], ["port_1", "port_2", "port_3", "port_4"]),
         (["cam1", "cam2"], ["walk_cam1", "walk_cam2", "run_cam1", "run_cam2"]),
         (["a", "b"], ["front", "back"]),
+        (["cam1", "cam2", "cam3", "cam4"], ["cam0", "cam1", "cam2", "cam3"]),  # shifted by one, perhaps
         (["cam1", "cam2"], ["cam1"]),
         (["cam1", "cam2"], []),
     ],

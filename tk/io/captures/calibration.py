@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -183,9 +184,10 @@ def _check_poses(cameras: Sequence[Camera], path: Path) -> None:
         )
 
 
-def camera_table(camera: Camera, turns: int = 0) -> dict[str, object]:
-    """Return the table of a camera in `calibration.toml`, metres, with its clockwise quarter turns if there are any."""
-    turned = {"rotation_count": turns} if turns else {}
+def camera_table(camera: Camera, turns: int = 0, late_s: float = 0.0) -> dict[str, object]:
+    """Return the table of a camera in `calibration.toml`, metres, with its clockwise quarter turns and its delay,
+    seconds, if there are any."""
+    others = ({"rotation_count": turns} if turns else {}) | ({"time_offset": late_s} if late_s else {})
     return {
         "name": camera.name,
         "size": [camera.width, camera.height],
@@ -194,7 +196,7 @@ def camera_table(camera: Camera, turns: int = 0) -> dict[str, object]:
         "rotation": np.asarray(cv2.Rodrigues(camera.rotation)[0]).ravel().tolist(),
         "translation": camera.translation.tolist(),
         "fisheye": camera.fisheye,
-        **turned,
+        **others,
     }
 
 
@@ -339,4 +341,5 @@ def match_camera(name: str, key: str, stems: Iterable[str]) -> str | None:
 
 
 def _bare(text: str) -> str:
-    return re.sub(r"[\W_]", "", text)
+    composed = unicodedata.normalize("NFC", text)  # macOS separates letters and their accents
+    return re.sub(r"[\W_]", "", composed)

@@ -18,7 +18,7 @@ from tk.io.captures.capture_toml import CaptureSettings, Span
 from tk.io.captures.clip import Clip, Reader
 from tk.io.captures.clip_folder import MASKS_RECORD
 from tk.io.captures.referred import open_referred, referred_stamps
-from tk.io.captures.timing import DRIFT_FRAMES, ROUNDED, ROUNDED_INTERVAL, Stamps, nominal_rate
+from tk.io.captures.timing import DRIFT_FRAMES, ROUNDED, ROUNDED_INTERVAL, Stamps, slowest_rate
 from tk.io.toml import load_toml
 
 Float = NDArray[np.float64]
@@ -101,7 +101,7 @@ def choose_clock(
             f"to fps = {fps:g} of capture.toml; remove fps, or correct it; if the videos play in slow motion what was "
             f'recorded at {fps:g} frames/s, add times = "fps" and do not resample'
         )
-    fps = fps or min(nominal_rate(nominal_rate(each.own_rate), len(each.seconds)) for each in stamps)
+    fps = fps or slowest_rate(stamps)
     last_in = max(stamps, key=lambda each: float(each.since_start[0]))
     first_out = min(stamps, key=lambda each: float(each.since_start[-1]))
     begin, end = float(last_in.since_start[0]), float(first_out.since_start[-1])

@@ -69,7 +69,8 @@ def read_keypoints(folder: Path, capture: Capture, frame: int) -> list[Float]:
         raise CaptureError(f"{folder}: is no folder; keypoints are a folder a camera with a JSON file a picture")
     found = {path.name.removesuffix("_json"): path for path in sorted(folder.iterdir()) if path.is_dir()}
     people = []
-    for camera, key, late in zip(capture.rig, capture.calibration.keys, capture.late_frames, strict=True):
+    cameras = zip(capture.rig, capture.calibration.keys, capture.clips, capture.late_frames, strict=True)
+    for camera, key, clip, late in cameras:
         try:
             name = match_camera(camera.name, key, found)
         except CaptureError as ambiguous:
@@ -77,14 +78,17 @@ def read_keypoints(folder: Path, capture: Capture, frame: int) -> list[Float]:
         if name is None:
             there = ", ".join(path.name for path in found.values()) or "no folders"
             raise CaptureError(f"{folder}: camera {camera.name!r} has no folder of keypoints; there are {there}")
-        people.append(read_people(_file_of(found[name], frame - late)))
+        picture = int(clip.shown(np.array([frame - late]))[0])
+        if picture < 0:
+            raise CaptureError(f"{clip.path}: has no image near frame {frame}; choose another [init] frame")
+        people.append(read_people(_file_of(found[name], picture)))
     return people
 
 
 def _file_of(folder: Path, picture: int) -> Path:
     """Return the file of an image."""
     numbers: dict[int, Path] = {}
-    for count, path in enumerate(sorted(folder.glob("*.json"))):
+    for count, path in enumerate(sorted(folder.glob("[!.]*.json"))):
         number = _NUMBER.search(path.stem)
         if count >= _MOST_FILES:
             raise CaptureError(f"{folder}: holds over {_MOST_FILES} files")

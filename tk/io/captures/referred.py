@@ -16,7 +16,7 @@ from tk.io.captures.calibration import Calibration, match_camera
 from tk.io.captures.capture_toml import GivenVideo
 from tk.io.captures.clip import Clip, Image, Reader
 from tk.io.captures.clip_folder import check_calibrated
-from tk.io.captures.timing import Stamps, own_times
+from tk.io.captures.timing import Stamps, chapter_shifts, own_times
 from tk.io.captures.video import as_calibrated, probe_video
 
 Float = NDArray[np.float64]
@@ -58,15 +58,11 @@ class Chapters(Clip):
 
 
 def _joined(times: Sequence[Float | None]) -> Float | None:
-    """Return the times of all chapters: each begins one interval, the median of the one before, after its end."""
-    joined = np.empty(0)
-    interval = 0.0
-    for own in times:
-        if own is None or not len(own):
-            return None
-        interval = float(np.median(np.diff(own))) if len(own) > 1 else interval
-        joined = np.append(joined, own - own[0] + joined[-1] + interval) if len(joined) else own
-    return joined
+    """Return the times of all chapters, one after the other; None if a file gives none."""
+    known = [own for own in times if own is not None and len(own)]
+    if len(known) < len(times) or max(map(len, known)) < 2:
+        return None
+    return np.concatenate([own + shift for own, shift in zip(known, chapter_shifts(known), strict=True)])
 
 
 class _ChapterReader:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -61,8 +62,7 @@ class Stamps:
     @property
     def own_rate(self) -> float:
         """Rate of the camera, 1/s, also where single images are missing."""
-        intervals = np.diff(self.seconds)
-        return 1.0 / float(intervals[intervals < _GAP * np.median(intervals)].mean())
+        return 1.0 / image_interval(self.seconds)
 
     @property
     def since_start(self) -> Float:
@@ -89,7 +89,7 @@ def read_stamps(
     Raises:
         CaptureError: a file of time stamps is missing, cannot be read, or does not fit its clip.
     """
-    files = {path.stem: path for path in sorted(folder.glob("timestamps/*.csv"))}
+    files = {path.stem: path for path in sorted(folder.glob("timestamps/[!.]*.csv"))}
     if not files:
         return tuple(_of_container(clip, regular) for clip in clips)
     found = []
@@ -186,6 +186,28 @@ def check_clock(
 
 def _contradiction(message: str, resample: bool) -> ClockError:
     return ClockError(message, hint="or choose frames by their time stamps with --resample" if resample else "")
+
+
+def image_interval(seconds: Float) -> float:
+    """Return a camera's mean interval from one image to the next, seconds, without the gaps of missing images."""
+    intervals = np.diff(seconds)
+    return float(intervals[intervals < _GAP * np.median(intervals)].mean())
+
+
+def slowest_rate(stamps: Sequence[Stamps]) -> float:
+    """Return the rate of the slowest camera, 1/s, as cameras name it."""
+    return min(nominal_rate(nominal_rate(each.own_rate), len(each.seconds)) for each in stamps)
+
+
+def chapter_shifts(times: Sequence[Float]) -> list[float]:
+    """Return what is added to the time stamps of each chapter of a recording, seconds: 0 for the first; a further one
+    begins one interval of the chapter before it after the end of that chapter. A chapter has two images or more."""
+    shifts = [0.0]
+    known = next(own for own in times if len(own) > 1)
+    for before, own in pairwise(times):
+        known = before if len(before) > 1 else known
+        shifts.append(float(before[-1] + shifts[-1] + image_interval(known) - own[0]))
+    return shifts
 
 
 def nominal_rate(fps: float, count: int = 0) -> float:

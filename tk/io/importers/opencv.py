@@ -93,7 +93,7 @@ def _stereo(documents: Sequence[tuple[Path, Mapping[str, Any]]]) -> list[tuple[s
     for side in ("1", "2"):
         own = {key.rstrip("_")[: -len(side)]: value for key, value in merged.items() if key.endswith(side)}
         table = Table({**_shared_size(whole), **own}, f"{whole.where}: camera {side}", CalibrationError)
-        if not _entry(table, _MATRIX):
+        if not isinstance(table.values.get(_entry(table, _MATRIX)), list):  # k1 and k2 may be distortions
             return None
         pair.append((f"cam{side}", table, np.zeros(3), np.zeros(3)))
     if not (_entry(whole, _ROTATION) and _entry(whole, _TRANSLATION)):

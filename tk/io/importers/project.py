@@ -37,6 +37,7 @@ class Project:
     masks: tuple[Path, ...] = ()
     backgrounds: tuple[Path, ...] = ()
     turns: tuple[int, ...] = ()  # clockwise quarter turns after which each camera's image is upright; empty: none
+    time_offset_s: tuple[float, ...] = ()  # delay of each camera, seconds; empty: none
     # width and height of each camera as the file has them, if they are no whole numbers, else None; empty: all None
     fractional: tuple[tuple[float, float] | None, ...] = ()
     notes: tuple[str, ...] = ()  # lines for the user about what was inferred or left out
@@ -92,7 +93,10 @@ class Tables:
         arrays |= {"rotation": rotation, "translation": translation}
         values = {name: np.asarray(array).tolist() for name, array in arrays.items()}
         table = {"name": name, "rotation_count": turns, "fisheye": fisheye, **values}
-        self.cameras[key if key and key not in self.cameras else name] = table
+        key = key if key and key not in self.cameras else name
+        if key in self.cameras:
+            raise CalibrationError(f"{self.source}: two cameras have the name {name!r}; give each its own")
+        self.cameras[key] = table
 
     @contextmanager
     def optional(self, name: str, marker: bool) -> Iterator[None]:
@@ -193,6 +197,7 @@ def read_format(form: Format, files: Sequence[Path], folder: Path, wanted: Wante
         backgrounds=_beside(folder, found.folder, ("background", "backgrounds"), chosen_names, notes),
         up=FoundUp(form.up, f"as {form.tool} defines it") if form.up else calibration.mounting,
         turns=tuple(calibration.turns[index] for index in chosen),
+        time_offset_s=tuple(calibration.time_offset_s[index] for index in chosen),
         fractional=tuple(_fractional(tables.cameras[calibration.keys[index]].get("size")) for index in chosen),
         notes=tuple(notes),
     )

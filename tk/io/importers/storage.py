@@ -17,6 +17,8 @@ from tk.io.toml import read_text
 
 #: an entry of a table: its key, perhaps in quotes, and what follows
 _ENTRY = re.compile(r"""(?:"([^"]*)"|'([^']*)'|([^\s:#%\-\[\]{}][^:]*?))\s*:(?:\s+(.*)|)$""", re.S)
+#: entries that are text even if they look like a number, such as a serial number
+_NAMES = ("name", "camera_name")
 #: a tag of YAML, such as !!opencv-matrix
 _TAG = re.compile(r"^![^\s]*\s*")
 
@@ -38,9 +40,9 @@ def read_storage(path: Path) -> Mapping[str, Any]:
 
 
 def numbers(value: Any) -> Any:
-    """Return a value with numbers in place of texts that are one, at any depth."""
+    """Return a value with numbers in place of texts that are one, at any depth; names stay texts."""
     if isinstance(value, Mapping):
-        return {key: numbers(item) for key, item in value.items()}
+        return {key: item if key in _NAMES else numbers(item) for key, item in value.items()}
     if isinstance(value, list):
         return [numbers(item) for item in value]
     if isinstance(value, str):

@@ -112,7 +112,8 @@ def match_clips(cameras: Sequence[CameraNames], stems: Sequence[str]) -> Sequenc
 
     The first rule that matches most cameras counts, and no rule may match two cameras with one clip: equal names; one
     name within the other ("cam01" in "int_cam01_img"); the number in which the names differ ("cam_0", "port_0"); the
-    names without their common beginning and end ("A", "trial1-camA").
+    names without their common beginning and end ("A", "trial1-camA"). Of as many clips as cameras, all must match:
+    "cam1" to "cam4" and "cam0" to "cam3" may be the same cameras.
     """
     best, most = None, 1
     for found in (
@@ -122,7 +123,8 @@ def match_clips(cameras: Sequence[CameraNames], stems: Sequence[str]) -> Sequenc
         _by_difference(cameras, stems, _differences),
     ):
         taken = [stem for stem in found if stem is not None]
-        if len(taken) == len(set(taken)) > most:
+        whole = len(taken) == len(cameras) or len(cameras) != len(stems)
+        if whole and len(taken) == len(set(taken)) > most:
             best, most = found, len(taken)
     return best
 
@@ -135,7 +137,7 @@ def in_order_of_names(cameras: Sequence[CameraNames], stems: Sequence[str]) -> l
 
 def natural(text: str) -> list[tuple[int, str]]:
     """Return a key that sorts numbers in names by value: cam2 before cam10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", text) if part]
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", text) if part]
 
 
 def _equal(camera: CameraNames, stems: Sequence[str]) -> str | None:

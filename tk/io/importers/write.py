@@ -67,8 +67,8 @@ def write_capture(project: Project, output: Path) -> Imported:
         notes.append(f"[volume] center = {center}, size = {size} (metres): {where}")
 
     metadata = {"units": "m", "imported_from": f"{project.tool}, {text_of(project.source.name)}"}
-    turns = project.turns or (0,) * len(rig)
-    tables = {camera.name: camera_table(camera, turn) for camera, turn in zip(rig, turns, strict=True)}
+    turns, late = project.turns or (0,) * len(rig), project.time_offset_s or (0.0,) * len(rig)
+    tables = {camera.name: camera_table(camera, turn, own) for camera, turn, own in zip(rig, turns, late, strict=True)}
     settings = capture_toml(text_of(output.resolve().name), project, volume, where)
     with replacing(output, CaptureError) as draft:
         shutil.rmtree(draft, ignore_errors=True)  # of an import that was killed
