@@ -18,16 +18,19 @@ import numpy as np
 import pytest
 
 from tests.conftest import QUICK, Tk, track
+from tests.made_results import write_motion
 from tk.batch import Job, Outcome, exit_code
-from tk.batch.jobs import DONE, FAILED, make_jobs
+from tk.batch.jobs import BEGUN, DONE, FAILED, make_jobs
 from tk.batch.run import _finished
 from tk.batch.summary import write_summary
 from tk.batch.work import _errors, work
 from tk.errors import CaptureError, ConfigError, ResultError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
+from tk.io.results.status import Status
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.skeleton import JOINTS, build_skeleton
+from tk.run.session import Summary
 from tk.run.task import RecordingOptions
 from tk.system.files import locked
 
@@ -101,7 +104,7 @@ def test_summary_lists_all_outcomes(tmp_path: Path) -> None:
         zip(
             [job.name for job in jobs],
             [
-                Outcome(DONE, 10, 6, 1, 10, 5.0, 2.345, 1.5, 0.031, 1.8, ("a note, with a comma",)),
+                Outcome(DONE, 10, 6, 1, 10, 5.0, 2.345, 1.5, 0.031, 1.8, ("a note, with a comma",), mostly_lost=True),
                 Outcome(FAILED, failure="x.mp4: is cut off"),
                 Outcome(),
             ],
@@ -124,8 +127,52 @@ def test_summary_lists_all_outcomes(tmp_path: Path) -> None:
     assert 'http-equiv="refresh"' not in (tmp_path / "out" / "summary.html").read_text(encoding="utf-8")
 
 
+def test_summary_lists_captures_of_earlier_calls(tmp_path: Path) -> None:
+    ann, bob, out = folders(tmp_path / "ann", tmp_path / "bob", tmp_path / "out" / "jobs")
+    earlier, now = make_jobs([ann, bob], out.parent, RecordingOptions())
+    earlier.write(Outcome(DONE, 20, 1, notes=("of yesterday",)))
+    now.write(Outcome(BEGUN))
+    (out / ".bob.part.json").write_text("half writ")  # a worker writes its record meanwhile
+    write_summary(out.parent, [now], {"bob": Outcome(DONE, 5)})
+    with (out.parent / "summary.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["name"], row["capture"]) for row in rows] == [("bob", str(bob)), ("ann", str(ann))]
+    assert [(row["state"], row["frames"], row["notes"]) for row in rows] == [
+        ("done", "5", ""),
+        ("done", "20", "of yesterday"),
+    ]
+    page = (out.parent / "summary.html").read_text(encoding="utf-8")
+    assert "2 done" in page and "25 frames, 1 of them lost" in page
+    assert [job.name for job in make_jobs([bob, ann], out.parent, RecordingOptions())] == ["bob", "ann"]
+    # one that was interrupted, and is not continued by this call, keeps no page waiting
+    earlier.write(Outcome(BEGUN))
+    write_summary(out.parent, [now], {"bob": Outcome(DONE, 5)})
+    assert 'http-equiv="refresh"' not in (out.parent / "summary.html").read_text(encoding="utf-8")
+
+
+def test_absent_person_is_no_lost_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in `tk track`, the frames with the person are judged."""
+    (job,) = make_jobs(folders(tmp_path / "walk", tmp_path / "jobs")[:1], tmp_path, RecordingOptions())
+    skeleton = build_skeleton(BodyDimensions.from_stature(1.75))
+    status = np.array([Status.ABSENT] * 12 + [Status.LOST] * 5 + [Status.SUSPECT] * 2 + [Status.TRACKED] * 6, np.uint8)
+
+    def made(capture: object, output: Path, *_: object, **options: object) -> Summary:
+        poses = np.zeros((len(status), len(skeleton.names)))
+        write_motion(output, skeleton, poses, {}, lambda f: {"status": status[f]})
+        return Summary(status, 1.0, len(status))
+
+    monkeypatch.setattr("tk.io.importers.open_recording", lambda *_: None)
+    monkeypatch.setattr("tk.run.session.track", made)
+    outcome = work(job)
+    assert (outcome.state, outcome.frames, outcome.lost, outcome.suspect) == (DONE, 25, 5, 2), outcome.failure
+    assert outcome.mostly_lost and job.read() == outcome
+    status[12:14] = Status.TRACKED
+    job.output.unlink()
+    assert not work(job).mostly_lost
+
+
 def test_exit_codes() -> None:
-    good, lost = Outcome(DONE, 10, 5), Outcome(DONE, 10, 6)
+    good, lost = Outcome(DONE, 10, 5), Outcome(DONE, 10, 6, mostly_lost=True)
     bad, defect = Outcome(FAILED, failure="no such file"), Outcome(FAILED, failure="a defect", trace="Traceback …")
     assert exit_code({"a": good}) == 0
     assert exit_code({"a": good, "b": lost}) == 3
@@ -206,14 +253,15 @@ def test_error_without_offsets_is_not_given_for_a_still_person(tmp_path: Path) -
     bent = still + 0.0
     bent[[JOINTS.index(f"{name}_l") for name in ("elbow", "wrist", "knee", "ankle")], 0] += 0.3
 
-    def errors(second: np.ndarray) -> tuple[tuple[float | None, float | None], list[str]]:
+    def errors(*second: np.ndarray) -> tuple[tuple[float | None, float | None], list[str]]:
         notes: list[str] = []
-        positions = np.array([still, second] * 6)
         for path, shift in ((capture / "truth.h5", 0.0), (job.output, 0.02)):
             with h5py.File(path, "w") as file:
                 file["frames"] = np.arange(12)
-                file["joints/position"] = positions + shift
-                file["joints/position"].attrs["names"] = list(JOINTS)
+                for person, other in enumerate(second):
+                    positions = np.array([still, other] * 6) + shift + [2.0 * person, 0, 0]
+                    file[f"people/{person}/joints/position"] = positions
+                    file[f"people/{person}/joints/position"].attrs["names"] = list(JOINTS)
         return _errors(job, notes.append), notes
 
     (error_cm, limbs_cm), notes = errors(still)
@@ -221,6 +269,9 @@ def test_error_without_offsets_is_not_given_for_a_still_person(tmp_path: Path) -
     assert len(notes) == 1 and "the limbs move by 0.0 cm" in notes[0]
     (_, limbs_cm), notes = errors(bent)
     assert limbs_cm == pytest.approx(0, abs=1e-6) and not notes
+    (error_cm, limbs_cm), notes = errors(still, bent)
+    assert error_cm == pytest.approx(2 * np.sqrt(3)) and limbs_cm == pytest.approx(0, abs=1e-6) and not notes
+    assert errors(still, still)[0][1] is None
 
 
 def test_two_batches_in_one_folder_are_refused(tk: Tk, tiny: Path, tmp_path: Path) -> None:

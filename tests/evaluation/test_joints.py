@@ -234,6 +234,25 @@ def test_joints_without_truth_are_excluded_and_reported() -> None:
     assert np.isnan(nothing.mean_cm)
 
 
+def test_absent_person_is_not_judged() -> None:
+    truth = make_truth()
+    gone, seen = truth.positions.copy(), truth.positions.copy()
+    gone[:8] = np.nan
+    seen[:4] = np.nan
+    status = np.zeros(20, np.uint8)
+    status[:4], status[4:6], status[9] = Status.ABSENT, Status.SUSPECT, Status.LOST
+    result = as_result(truth, positions=seen, status=status)
+    found = evaluate(result, replace(truth, positions=gone))
+    assert (found.judged, found.lost, found.suspect, found.nan_frames) == (12, 1, 0, 0)
+    assert (found.without_truth, found.unknown_joints) == (8, 0)
+    assert found.lost_share == pytest.approx(1 / 12)
+    part = replace(result, frames=truth.frames[4:], positions=seen[4:], status=status[4:])
+    part = replace(part, **{name: np.delete(getattr(part, name), 2, 0) for name in ("frames", "positions", "status")})
+    assert evaluate(part, replace(truth, positions=gone)).missing_inside == 0
+    with pytest.raises(ResultError, match="no frames in the other"):
+        evaluate(result, replace(truth, positions=np.full_like(gone, np.nan)))
+
+
 def test_files_without_common_frames_are_refused() -> None:
     truth = make_truth()
     with pytest.raises(ResultError, match=r"result\.h5: .*truth\.h5: frames 100 to 119 .* frames 0 to 19"):

@@ -97,12 +97,24 @@ def test_person_is_judged_only_while_in_the_ground_truth() -> None:
     assert found.mota == found.idf1 == 1.0
 
 
+def test_false_positives_count_also_while_nobody_is_there() -> None:
+    positions = TRUTH[0].positions.copy()
+    positions[COUNT // 2 :] = np.nan
+    found = evaluate_people((TRUTH[0],), (replace(TRUTH[0], positions=positions),))
+    assert (found.frames, found.people[0].frames, found.false_positives) == (COUNT, COUNT // 2, COUNT // 2)
+    assert found.mota == 0 and found.idf1 == pytest.approx(2 / 3)
+    nobody = evaluate_people((TRUTH[0],), (replace(TRUTH[0], positions=np.full_like(positions, np.nan)),))
+    assert nobody.false_positives == COUNT and np.isnan([nobody.mota, nobody.idf1]).all()
+    assert nobody.to_dict()["mota"] is None and "MOTA nan" in nobody.format_table()
+
+
 def test_one_tracked_person_among_two_leaves_the_other_missed() -> None:
     found = evaluate_people((only(TRUTH[1], np.arange(COUNT) < 12),), (FAR, TRUTH[1]))
     first, second = found.people
     assert first.errors is None and first.matches == 0 and first.frames == second.frames == second.matches == 12
     assert "person 0" in found.format_table() and max(map(len, found.format_table().splitlines())) <= 100
     json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert second.errors is not None and second.errors.raw.all.mean_cm == 0, "to_dict leaves the scores as they are"
 
 
 def test_files_without_common_frames_are_refused() -> None:

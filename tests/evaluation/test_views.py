@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import h5py
 import numpy as np
 import pytest
 
 from tests.conftest import QUICK, Tk, track
+from tests.io.result_files import revise_result
 from tests.model.figures import draw_silhouettes
 from tk.evaluation.views import capture_of, evaluate_views
 from tk.export import export
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
+from tk.io.results.data import UsedCameras
 from tk.io.results.reader import read_joints, read_result
+from tk.io.results.status import Status
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.joints import BODIES
 from tk.model.body.skeleton import JOINTS, Skeleton, skeleton_of_names
+from tk.model.cameras.camera import Rig
 from tk.trackers.bodies import body_and_poses
 
 
@@ -53,6 +59,26 @@ def test_scores_of_all_views_equal_a_direct_computation(tiny: Path, three_views:
         assert view.silhouette_error == pytest.approx(np.mean(shares))
     assert found.joint_px == pytest.approx(np.mean([view.joint_px for view in found.views[:3]]))
     assert found.silhouette_error == pytest.approx(np.mean([view.silhouette_error for view in found.views]))
+
+
+def test_silhouettes_are_those_of_the_cameras_of_the_run(tiny: Path, three_views: Path, tmp_path: Path) -> None:
+    """The run has refined the rotation of one camera and the time offset of another; lost frames are omitted."""
+    path = Path(shutil.copy(three_views, tmp_path / "refined.h5"))
+    capture, (body, poses) = open_capture(tiny), body_and_poses(read_result(three_views)) or pytest.fail("no body")
+    turned = replace(capture.rig[0], rotation=cv2.Rodrigues(np.array([0.0, 0.02, 0.0]))[0] @ capture.rig[0].rotation)
+    used = Rig((turned, *capture.rig[1:3]))
+    revise_result(path, cameras=UsedCameras(used, np.array([0.0, -1 / capture.fps, 0.0])))
+    with h5py.File(path, "a") as file:
+        file["status"][2] = Status.LOST
+        file["pose"][2, 0] += 1.0
+    with capture.frames(0, 3) as frames:
+        masks = np.array([frame.masks for frame in frames]) >= 128
+    drawn = draw_silhouettes(body, Rig((*used, capture.rig[3])), poses) >= 128
+    late = (0, 1, 0, 0)
+    for v, view in enumerate(evaluate_views(path, tiny / "truth.h5", tiny).views):
+        seen = [masks[i + late[v], v] for i in range(2)]
+        shares = [(drawn[i, v] != seen[i]).sum() / seen[i].sum() for i in range(2)]
+        assert view.silhouette_error == pytest.approx(np.mean(shares))
 
 
 def test_command_finds_the_capture_beside_the_truth(tk: Tk, tiny: Path, three_views: Path, tmp_path: Path) -> None:

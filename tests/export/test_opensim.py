@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.export.conftest import BODY, FIRST, FPS, FRAMES, LOST, SKELETON, Write, poses
@@ -149,6 +150,15 @@ def test_mot_angles_of_a_level_arm_do_not_jump() -> None:
     np.testing.assert_allclose(found[-1], [10.0, -20.0, 5.0], atol=1e-6)
     steep = compose("zxy", np.radians([[10.0, -75.0, 20.0], [30.0, 60.0, -20.0]]))
     np.testing.assert_allclose(compose("zxy", follow_rotations("zxy", steep)), steep, atol=1e-12)
+
+
+@pytest.mark.parametrize(("level", "lowered"), [(-90.0, True), (-87.0, True), (-87.0, False), (-84.0, False)])
+def test_recording_may_begin_with_level_arms(level: float, lowered: bool) -> None:
+    """Turned arms that are lowered later, or are at least 3° from level, have their angles from the first frame."""
+    angles = np.repeat([[0.0, level, 60.0]], 60, axis=0)
+    angles[30:, 1] += np.arange(30) * 3.0 * lowered
+    found = np.degrees(follow_rotations("zxy", compose("zxy", np.radians(angles))))
+    np.testing.assert_allclose(found, angles, atol=4.0)
 
 
 def test_mot_angles_are_continuous(write: Write) -> None:

@@ -128,6 +128,15 @@ def test_page_has_errors_only_with_a_truth(complete: Path, tiny: Path, tmp_path:
     found = evaluate_files(complete, tiny / "truth.h5")
     assert errors["rows"][1] == ["12 limb joints", found.raw.limbs.mean_cm, found.corrected.limbs.mean_cm]
     assert unpacked(errors["frames"]).mean() == pytest.approx(found.raw.all.mean_cm, rel=1e-4)
+    assert result.sigma is not None
+    turned = replace(
+        result,
+        meta=replace(result.meta, joint_names=JOINTS[::-1]),
+        joints=result.joints[:, ::-1],
+        sigma=result.sigma[:, ::-1],
+    )
+    again = data_of(build_page(turned, [], truth=tiny / "truth.h5"))["people"][0]["truth"]
+    assert again["frames"] == errors["frames"], "whatever the order of the joints in the file"
 
 
 def test_page_loads_nothing_and_escapes_text(complete: Path) -> None:
@@ -297,6 +306,10 @@ def test_page_shows_all_sections(opened: Page) -> None:
     assert opened.run("document.querySelectorAll('#notes li')[1].textContent") == NOTE
     assert opened.run("document.getElementById('title').textContent") == "made <up>"
     assert opened.run("document.querySelectorAll('#angle-charts .chart').length") > 15
+    bands = opened.run(
+        "[...document.querySelectorAll('.band')].map((path) => path.getAttribute('d').split('M').length)"
+    )
+    assert sorted(bands) == [2, 2, 2, 3], "σ of an elbow is unknown in one frame, which divides its band"
     assert opened.run("document.querySelectorAll('#sigma-table tr').length") == 16
     assert opened.run("[...document.images].every((image) => image.complete && image.naturalWidth > 100)") is True
     assert opened.run("document.images.length") >= 3

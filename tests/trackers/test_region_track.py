@@ -27,7 +27,7 @@ from tk.io.captures.capture import open_capture
 from tk.io.results.data import Result
 from tk.io.results.reader import read_joints, read_result
 from tk.io.results.status import Status
-from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.anthropometry import AVERAGE_BODY, BodyDimensions
 from tk.model.setup import Subject
 from tk.run.offline import REFINED
 from tk.run.plan import recording_task
@@ -352,6 +352,8 @@ def test_a_body_given_by_dimensions_is_used(tk: Tk, quick: Path, tiny: Path, tmp
     assert (model["dimensions/thigh"], model["dimensions/calf"]) == pytest.approx((0.45, average.calf))
     body = read_body(file, "-y")
     assert body.dimensions.thigh == 0.45 and body.skeleton.T_world_body[1, 2] == -1
+    file.write_text("[dimensions]\nthigh = 0.45\n", encoding="utf-8")
+    assert read_body(file, "z").dimensions == replace(AVERAGE_BODY, thigh=0.45)
 
 
 @pytest.mark.parametrize(

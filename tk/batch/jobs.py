@@ -67,16 +67,12 @@ class Outcome:
     notes: tuple[str, ...] = ()  # notes of the run
     failure: str = ""  # reason of a failure, in one line
     trace: str = ""  # traceback of a defect; empty if the input is the reason
+    mostly_lost: bool = False  # whether more than half of the frames with the person are lost or suspect
 
     @property
     def failed(self) -> bool:
         """Whether tracking did not end with a result."""
         return self.state == FAILED
-
-    @property
-    def mostly_lost(self) -> bool:
-        """Whether more than half of the frames are lost or suspect."""
-        return self.state == DONE and 2 * (self.lost + self.suspect) > self.frames
 
     @property
     def frames_per_second(self) -> float | None:
@@ -129,11 +125,7 @@ class Job:
                     f"{self.output}: was made with {name} {found}, not {value}; "
                     f"choose another folder, or remove the file and {self.record}"
                 )
-        try:
-            outcome = Outcome(**{f.name: record[f.name] for f in fields(Outcome)})
-            return replace(outcome, notes=tuple(map(str, outcome.notes)))
-        except (KeyError, TypeError):
-            raise _damaged(self.record) from None
+        return _outcome(record, self.record)
 
 
 def make_jobs(captures: Sequence[Path], folder: Path, options: RecordingOptions, pictures: bool = False) -> list[Job]:
@@ -151,7 +143,7 @@ def make_jobs(captures: Sequence[Path], folder: Path, options: RecordingOptions,
     for path in paths:
         check_not_input(folder, capture=path)
     known: dict[str, str] = {}
-    for record in sorted((folder / RECORDS).glob("*.json")):
+    for record in _records(folder):
         known[str(_read_record(record).get("capture"))] = record.stem
     taken = set(known.values())
     jobs = []
@@ -163,6 +155,17 @@ def make_jobs(captures: Sequence[Path], folder: Path, options: RecordingOptions,
             raise ResultError(f"{job.output}: exists, but not from tk batch; choose another folder")
         jobs.append(job)
     return jobs
+
+
+def other_outcomes(jobs: Sequence[Job], folder: Path) -> list[tuple[Job, Outcome]]:
+    """Return jobs and outcomes of earlier runs into this folder, of the captures that are not among ``jobs``."""
+    named, found = {job.name for job in jobs}, []
+    for path in _records(folder):
+        if path.stem not in named:
+            record = _read_record(path)
+            job = Job(path.stem, Path(str(record.get("capture"))), folder, RecordingOptions())
+            found.append((job, _outcome(record, path)))
+    return found
 
 
 def _free_name(path: Path, taken: set[str]) -> str:
@@ -179,6 +182,11 @@ def _free_name(path: Path, taken: set[str]) -> str:
     return f"{parts[-1]}_{number}"
 
 
+def _records(folder: Path) -> list[Path]:
+    """Return the records of a batch, without those that are being written."""
+    return sorted(path for path in (folder / RECORDS).glob("*.json") if not path.match(".*.part.json"))
+
+
 def _read_record(path: Path) -> dict[str, Any]:
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
@@ -187,6 +195,14 @@ def _read_record(path: Path) -> dict[str, Any]:
     if not isinstance(record, dict):
         raise _damaged(path)
     return record
+
+
+def _outcome(record: dict[str, Any], path: Path) -> Outcome:
+    try:
+        outcome = Outcome(**{f.name: record[f.name] for f in fields(Outcome)})
+        return replace(outcome, notes=tuple(map(str, outcome.notes)))
+    except (KeyError, TypeError):
+        raise _damaged(path) from None
 
 
 def _damaged(path: Path) -> ResultError:

@@ -109,12 +109,12 @@ def run_batch(
 def exit_code(outcomes: Mapping[str, Outcome]) -> int:
     """Return the exit code of a batch.
 
-    0: all captures are tracked; 3: some have more than half of their frames lost; 2: some failed because of their
+    0: all captures are tracked; 3: some are mostly lost; 2: some failed because of their
     input; 1: some failed because of a defect or a killed worker.
     """
     failed = [outcome for outcome in outcomes.values() if outcome.failed]
     if failed:
-        return 1 if any(outcome.trace or outcome.state != FAILED for outcome in failed) else 2
+        return 1 if any(outcome.trace for outcome in failed) else 2
     return 3 if any(outcome.mostly_lost for outcome in outcomes.values()) else 0
 
 

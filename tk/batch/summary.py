@@ -11,7 +11,7 @@ from datetime import datetime
 from pathlib import Path
 from urllib.parse import quote
 
-from tk.batch.jobs import BEGUN, DONE, FAILED, WAITING, Job, Outcome
+from tk.batch.jobs import BEGUN, DONE, FAILED, WAITING, Job, Outcome, other_outcomes
 from tk.errors import ResultError
 from tk.io.paths import replacing
 
@@ -72,16 +72,17 @@ td.bad { color: #c2571a; font-weight: 600; }
 
 
 def write_summary(folder: Path, jobs: Sequence[Job], outcomes: Mapping[str, Outcome]) -> None:
-    """Write `summary.csv` and `summary.html`, each atomically."""
+    """Write `summary.csv` and `summary.html`, each atomically, with the captures of earlier runs after ``jobs``."""
+    running = any(outcomes[job.name].state in (WAITING, BEGUN) for job in jobs)
+    rows = [*((job, outcomes[job.name]) for job in jobs), *other_outcomes(jobs, folder)]
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
     writer.writerow(("name", "capture", "state", *(column.name for column in NUMBERS), "notes"))
-    for job in jobs:
-        outcome = outcomes[job.name]
+    for job, outcome in rows:
         values = [column.value(outcome) for column in NUMBERS]
         numbers = [f"{v:.4g}" if isinstance(v, float) else v for v in values]
         writer.writerow((job.name, job.capture, _state(outcome), *numbers, _notes(outcome)))
-    for name, text in (("summary.csv", table.getvalue()), ("summary.html", _page(folder, jobs, outcomes))):
+    for name, text in (("summary.csv", table.getvalue()), ("summary.html", _page(folder, rows, running))):
         with replacing(folder / name, ResultError) as part:
             part.write_text(text, encoding="utf-8")
 
@@ -94,15 +95,13 @@ def _notes(outcome: Outcome) -> str:
     return "; ".join(part for part in (outcome.failure, *outcome.notes) if part)
 
 
-def _page(folder: Path, jobs: Sequence[Job], outcomes: Mapping[str, Outcome]) -> str:
-    states = [outcomes[job.name].state for job in jobs]
-    running = any(state in (WAITING, BEGUN) for state in states)
+def _page(folder: Path, rows: Sequence[tuple[Job, Outcome]], running: bool) -> str:
     refresh = f'<meta http-equiv="refresh" content="{_REFRESH_S}">' if running else ""
     name = html.escape(folder.resolve().name)
-    has_truth = any(outcome.error_cm is not None for outcome in outcomes.values())
+    has_truth = any(outcome.error_cm is not None for _, outcome in rows)
     shown = [column for column in NUMBERS if column.heading and (has_truth or column.name not in _WITH_TRUTH)]
     heads = "".join(f"<th>{column.heading}<small>{column.unit}</small></th>" for column in shown)
-    body = "\n".join(_line(job, outcomes[job.name], shown) for job in jobs)
+    body = "\n".join(_line(job, outcome, shown) for job, outcome in rows)
     return f"""<!doctype html>
 <html lang="en">
 <head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">{refresh}
@@ -110,7 +109,7 @@ def _page(folder: Path, jobs: Sequence[Job], outcomes: Mapping[str, Outcome]) ->
 <style>{_STYLE}</style></head>
 <body>
 <h1>{name}</h1>
-<p class="muted">{html.escape(_counts(states, outcomes))}</p>
+<p class="muted">{html.escape(_counts([outcome for _, outcome in rows]))}</p>
 <div class="scroll"><table>
 <thead><tr><th class="text">capture</th><th class="text">state</th>{heads}<th class="text">notes</th></tr></thead>
 <tbody>
@@ -123,12 +122,13 @@ constant offsets; lower is better. E<sub>S</sub>: share of wrong pixels, body ou
 """
 
 
-def _counts(states: Sequence[str], outcomes: Mapping[str, Outcome]) -> str:
+def _counts(outcomes: Sequence[Outcome]) -> str:
+    states = [outcome.state for outcome in outcomes]
     counts = [(states.count(state), word) for state, word in ((DONE, "done"), (FAILED, "failed"))]
     counts.append((len(states) - sum(count for count, _ in counts), "waiting"))
-    frames = sum(outcome.frames for outcome in outcomes.values())
-    lost = sum(outcome.lost for outcome in outcomes.values())
-    suspect = sum(outcome.suspect for outcome in outcomes.values())
+    frames = sum(outcome.frames for outcome in outcomes)
+    lost = sum(outcome.lost for outcome in outcomes)
+    suspect = sum(outcome.suspect for outcome in outcomes)
     parts = [f"{count} {word}" for count, word in counts if count]
     when = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M")
     return (

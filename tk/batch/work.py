@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.batch.jobs import BEGUN, DONE, FAILED, Job, Outcome
 from tk.errors import ResultBusyError, TkError
+
+if TYPE_CHECKING:
+    from tk.io.results.data import JointTrack
 
 #: Dask topic of the workers' progress
 TOPIC = "tk-batch"
@@ -83,6 +84,7 @@ def _track(job: Job, reporter: _Reporter) -> Outcome:
         frames=summary.frames,
         lost=summary.lost,
         suspect=summary.suspect,
+        mostly_lost=summary.mostly_lost,
         tracked_now=summary.tracked_now,
         error_cm=error_cm,
         limbs_cm=limbs_cm,
@@ -93,7 +95,7 @@ def _track(job: Job, reporter: _Reporter) -> Outcome:
 
 def _errors(job: Job, note: Callable[[str], None]) -> tuple[float | None, float | None]:
     """Return the mean distances from the ground truth, cm: of all joints, and of the limbs without offsets; of several
-    people, those of the people who were found."""
+    people, the means of those who were found, without offsets of those whose limbs move."""
     from tk.evaluation.joints import evaluate
     from tk.evaluation.people import evaluate_people
     from tk.io.results.reader import read_people, read_truth
@@ -104,35 +106,34 @@ def _errors(job: Job, note: Callable[[str], None]) -> tuple[float | None, float 
     try:
         people, true = read_people(job.output), read_truth(truth)
         if len(people) == len(true) == 1:
-            found = [evaluate(people[0], true[0])]
+            found = [(evaluate(people[0], true[0]), true[0])]
         else:
-            found = [score.errors for score in evaluate_people(people, true).people if score.errors is not None]
-        moved_cm = _movement_cm(job, truth)
+            scores = evaluate_people(people, true).people
+            found = [(score.errors, true[score.person]) for score in scores if score.errors is not None]
     except TkError as error:
         note(f"no comparison with the ground truth: {error}")
         return None, None
     if not found:
         return None, None
-    error_cm = float(np.mean([each.raw.all.mean_cm for each in found]))
-    limbs_cm = float(np.mean([each.corrected.limbs.mean_cm for each in found]))
-    if moved_cm < _MOVEMENT_CM:
+    error_cm = float(np.mean([errors.raw.all.mean_cm for errors, _ in found]))
+    moved_cm = np.array([_movement_cm(track, people[0].frames) for _, track in found])
+    limbs_cm = np.array([errors.corrected.limbs.mean_cm for errors, _ in found])[moved_cm >= _MOVEMENT_CM]
+    if not len(limbs_cm):
         note(
-            f"no error without offsets: the limbs move by {moved_cm:.1f} cm about the trunk, less than "
+            f"no error without offsets: the limbs move by {moved_cm.max():.1f} cm about the trunk, less than "
             f"{_MOVEMENT_CM:g} cm, so constant offsets would explain nearly all of the error"
         )
-        limbs_cm = math.nan
-    return (error_cm if np.isfinite(error_cm) else None), (limbs_cm if np.isfinite(limbs_cm) else None)
+    has_limbs = len(limbs_cm) and np.isfinite(limbs_cm).all()
+    return (error_cm if np.isfinite(error_cm) else None), (float(limbs_cm.mean()) if has_limbs else None)
 
 
-def _movement_cm(job: Job, truth: Path) -> float:
-    """Return how far the limb joints move about the trunk in the tracked frames: the largest root mean square of the
-    joints, cm, by the ground truth."""
+def _movement_cm(truth: JointTrack, tracked: NDArray[np.int64]) -> float:
+    """Return how far a person's limb joints move about the trunk in the tracked frames: the largest root mean square
+    of the joints, cm, by the ground truth."""
     from tk.evaluation.joints import trunk_axes
-    from tk.io.results.reader import read_joints, read_truth
     from tk.model.body.joints import JOINTS, LIMB_JOINTS
 
-    track = read_truth(truth)[0]
-    p_world = track.positions[np.isin(track.frames, read_joints(job.output).frames)]
+    p_world = truth.positions[np.isin(truth.frames, tracked)]
     limbs = p_world[:, [JOINTS.index(name) for name in LIMB_JOINTS]] - p_world[:, None, JOINTS.index("pelvis")]
     in_trunk = np.einsum("fki,fjk->fji", trunk_axes(p_world), limbs)
     in_trunk = in_trunk[np.isfinite(in_trunk).all(axis=(1, 2))]

@@ -156,7 +156,6 @@ def end(output: Path, summary: Summary, quiet: bool, as_json: bool) -> None:
         next_step = "continue with the same command and --resume" if summary.frames else "no frame was finished"
         base.exit_with(1, f"interrupted; {next_step}")
     if wrong > WARN_SHARE * summary.present:
-        most = 2 * wrong > summary.present
-        advice = "do not use the result: check" if most else "check"
+        advice = "do not use the result: check" if summary.mostly_lost else "check"
         line = f"{output}: {wrong} of {summary.present} frames are lost or suspect; {advice} masks, calibration and "
-        base.exit_with(EXIT_LOST if most else 0, f"{line}working volume with tk inspect")
+        base.exit_with(EXIT_LOST if summary.mostly_lost else 0, f"{line}working volume with tk inspect")

@@ -8,7 +8,8 @@ Frames are matched by their source index. Failures of a tracker always count:
   means, because the user gets its positions.
 - A frame that is missing between the first and the last frame of the result counts as a frame of NaN. Frames of the
   ground truth before and after the result are counted and not judged.
-- A joint that is NaN in the ground truth is counted and not judged.
+- A joint that is NaN in the ground truth is counted and not judged. A frame in which all are NaN has no ground truth:
+  the person is absent.
 
 Different definitions of a joint (skin or bone, hip centre or hip marker) cause a constant offset, which is no tracking
 error. The corrected figures remove it: the median over the frames that are not lost of ``R_t^T (estimate - truth)``,
@@ -171,10 +172,11 @@ def evaluate(result: JointTrack, truth: JointTrack) -> Evaluation:
     Raises:
         ResultError: the two have no frame in common, or the result has no frames.
     """
-    if not np.isin(result.frames, truth.frames).any():
+    present = truth.frames[np.isfinite(truth.positions).all(axis=2).any(axis=-1)]
+    if not np.isin(result.frames, present).any():
         raise ResultError(
             f"{result.path}: has no frame in common with {truth.path}: "
-            f"{_span(result.frames)} in the one, {_span(truth.frames)} in the other"
+            f"{_span(result.frames)} in the one, {_span(present)} in the other"
         )
     inside = (truth.frames >= result.frames.min()) & (truth.frames <= result.frames.max())
     frames = truth.frames[inside]
@@ -190,6 +192,7 @@ def evaluate(result: JointTrack, truth: JointTrack) -> Evaluation:
         lost[found], suspect[found] = ~has_pose(status), status == Status.SUSPECT
 
     known = np.isfinite(p_truth).all(axis=2)
+    judged = known.any(axis=1)
     failed = ~np.isfinite(p_result).all(axis=2)
     difference = np.where((known & ~failed)[..., None], p_result - p_truth, np.nan)  # (F, J, 3)
     axes = trunk_axes(p_truth)
@@ -207,14 +210,14 @@ def evaluate(result: JointTrack, truth: JointTrack) -> Evaluation:
         raw=_scores(distances["raw"], lost),
         corrected=_scores(distances["corrected"], lost),
         offsets_cm={name: _triple(100 * offset) for name, offset in zip(JOINTS, offsets, strict=True)},
-        judged=len(frames),
-        missing_inside=int((~found).sum()),
+        judged=int(judged.sum()),
+        missing_inside=int((judged & ~found).sum()),
         missing_outside=int((~inside).sum()),
-        without_truth=int((~np.isin(result.frames, truth.frames)).sum()),
-        lost=int(lost.sum()),
-        suspect=int(suspect.sum()),
+        without_truth=int((~np.isin(result.frames, present)).sum()),
+        lost=int((judged & lost).sum()),
+        suspect=int((judged & suspect).sum()),
         nan_frames=int((failed & known).any(axis=1).sum()),
-        unknown_joints=int((~known).sum()),
+        unknown_joints=int((~known[judged]).sum()),
         frames_per_second=mean_rate,
         median_frames_per_second=median_rate,
         flexion=flexion_errors(p_result, p_truth),

@@ -69,10 +69,8 @@ class PeopleEvaluation:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON; infinity and NaN become None."""
-        values = {**vars(self), "match_cm": 100 * MATCH_M, "people": [vars(person) for person in self.people]}
-        for person in values["people"]:
-            person["errors"] = person["errors"] and person["errors"].to_dict()
-        return dict(plain_values(values))
+        people = [{**vars(score), "errors": score.errors and score.errors.to_dict()} for score in self.people]
+        return dict(plain_values({**vars(self), "match_cm": 100 * MATCH_M, "people": people}))
 
     def format_table(self) -> str:
         """Return the table that ``tk evaluate`` prints; lines have at most 100 characters."""
@@ -103,7 +101,7 @@ def evaluate_people(result: Sequence[JointTrack], truth: Sequence[JointTrack]) -
     rows = [{int(f): k for k, f in enumerate(track.frames) if _shows(track, k)} for track in truth]
     listed = np.concatenate([track.frames for track in result])
     first, last = (int(listed.min()), int(listed.max())) if len(listed) else (0, -1)
-    frames = sorted({frame for person in rows for frame in person if first <= frame <= last})
+    frames = sorted({int(f) for track in truth for f in track.frames if first <= f <= last})
     if not frames:
         raise ResultError(f"{result[0].path}: has no frame in common with {truth[0].path}")
     matched: list[dict[int, int]] = [{} for _ in truth]  # for each person of the truth: person of the result by frame
@@ -148,8 +146,8 @@ def evaluate_people(result: Sequence[JointTrack], truth: Sequence[JointTrack]) -
         misses=misses,
         false_positives=false_positives,
         switches=switches,
-        mota=1.0 - (misses + false_positives + switches) / present,
-        idf1=2 * kept / (present + found),
+        mota=1.0 - (misses + false_positives + switches) / present if present else float("nan"),
+        idf1=2 * kept / (present + found) if present else float("nan"),
         mean_distance_cm=100 * float(np.mean(distances_m)) if distances_m else float("nan"),
     )
 

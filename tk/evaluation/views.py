@@ -1,7 +1,7 @@
 """Compute the fit of a result to the images: the two measures of the silhouette paper (its section 5), for each view.
 
 - E_S (eq. 12): share of wrongly classified pixels. The body of the result is rendered into every view and compared
-  with the capture's masks.
+  with the capture's masks, with the cameras and time offsets of the run; lost frames are omitted.
 - Distance of chosen joints from ground truth in pixels: "averaged across both feet and all marked frames, and averaged
   across all the views used for tracking". The paper says "mean squared" and gives pixels; here it is the mean distance.
 
@@ -29,7 +29,7 @@ from tk.kernels.mask_values import PERSON
 from tk.model.body.joints import ANKLE_JOINTS, JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.cues.ray_costs import RayGrid, residual_of
-from tk.trackers.bodies import body_and_poses
+from tk.trackers.bodies import as_tracked, body_and_poses
 
 Float = NDArray[np.float64]
 
@@ -129,7 +129,7 @@ def evaluate_views(
     names = {name.strip() for name in str(used).split(",")}
     known = bool(names & set(opened.rig.names))  # not in a damaged state, or without one
     with as_damage_error(found.path, "the body or a pose"):
-        error, note = _silhouette_errors(found, opened)
+        error, note = _silhouette_errors(found, as_tracked(opened, found))
     views = []
     for v, camera in enumerate(opened.rig):
         px, share = _pixel_error(Rig((camera,)), estimate, position, joints)
@@ -158,7 +158,7 @@ def _mean_length(vectors: Float) -> float:
 
 
 def _silhouette_errors(result: Result, capture: Capture) -> tuple[list[float] | None, str]:
-    """Return the mean E_S of each view over the frames of the result, or None and the reason."""
+    """Return the mean E_S of each view over the frames of the result with a pose, or None and the reason."""
     found = body_and_poses(result)
     if found is None:
         return None, f"no E_S: {result.path} does not contain the tracked body"
@@ -166,18 +166,19 @@ def _silhouette_errors(result: Result, capture: Capture) -> tuple[list[float] | 
         return None, f"no E_S: {capture.path} has no masks/"
     body, poses = found
     row_of = {int(frame): row for row, frame in enumerate(result.frames)}
+    is_shown = result.has_pose & np.isfinite(result.pose).all(axis=1)
     first, last = int(result.frames.min()), int(result.frames.max())
     errors, grid = [], RayGrid(capture.rig, capture.rig.frame_shape[0])
     with capture.frames(first, last + 1) as frames:
         for frame in frames:
             row = row_of.get(frame.index)
-            if row is not None and frame.masks is not None and np.isfinite(result.pose[row]).all():
+            if row is not None and frame.masks is not None and is_shown[row]:
                 label = grid.render(body, poses[row][None]).label[0]
                 errors.append(residual_of(label > 0, grid.sample(frame.masks) >= PERSON).sum(axis=1))
     values = np.array(errors).reshape(-1, len(capture.rig))
     seen = np.isfinite(values)  # NaN for an empty mask
     if not seen.any(axis=0).all():
-        return None, f"no E_S: {capture.path} has a view whose masks are all empty"
+        return None, f"no E_S: {capture.path} has a view without a mask in the frames with a pose"
     return [float(values[seen[:, v], v].mean()) for v in range(len(capture.rig))], ""
 
 

@@ -1,14 +1,14 @@
 """Write C3D files, the format of motion laboratories, with points and segment rotations; see https://www.c3d.org.
 
 World frame of the result, millimetres. A point's residual is its standard deviation in whole millimetres, at most 127;
-0 if the result has none. It is written in both bytes of the fourth word, because readers disagree: the format has it in
+0 where it is unknown. It is written in both bytes of the fourth word, because readers disagree: the format has it in
 the lower one, ezc3d up to 1.7 in the upper one, where the format has a mask of cameras. In unknown frames the word is
 -1 and the coordinates are 0, the format's mark of a missing point. ROTATION, an extension, is each segment's 4×4
 transform to the world; in unknown frames it is NaN and its reliability -1.
 
-Frames have their numbers in the recording, from 1: in the header, whose numbers have 16 bits, and in the parameters
-TRIAL:ACTUAL_START_FIELD and ACTUAL_END_FIELD, whose numbers have 32 bits. A file of more than 65,535 frames has no
-rotations: ezc3d reads all frames of such a file only if points are its only data.
+Frames have their numbers in the recording, from 1: in the parameters TRIAL:ACTUAL_START_FIELD and ACTUAL_END_FIELD,
+whose numbers have 32 bits, and in the header, whose numbers have 16 bits; it counts from 1 if they do not fit. A file
+of more than 65,535 frames has no rotations: ezc3d reads all frames of such a file only if points are its only data.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def write_c3d(motion: Motion, path: Path) -> str | None:
     for name, values in data.items():
         groups[name]["DATA_START"], starts[name] = _integer(start), start
         start += len(values) // _BLOCK
-    begin = first if first <= _MOST else 1
+    begin = first if first + count - 1 <= _MOST else 1
     end = min(begin + count - 1, _MOST)
     header = struct.pack("<HHHHHfHHf", used, 0, begin, end, 0, -1.0, starts["POINT"], 0, motion.fps)
     path.write_bytes(b"".join([(_HEADER_KEY + header).ljust(_BLOCK, b"\0"), _section(groups), *data.values()]))

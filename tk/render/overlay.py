@@ -38,6 +38,7 @@ from tk.render.figure import Figure
 from tk.render.legend import LEGEND_HEIGHT, Legend
 from tk.render.palette import TEXT, Color
 from tk.render.people import People
+from tk.trackers.bodies import as_tracked
 
 Float = NDArray[np.float64]
 
@@ -245,21 +246,6 @@ def _no_wider(capture: Capture, widest: int) -> Capture:
     """Return a capture whose images are reduced to the width of a video or a little more. No tile is wider, and a
     smaller image takes less time to decode and to cut."""
     return capture.reduced([max(camera.width // widest, 1) for camera in capture.rig])
-
-
-def as_tracked(capture: Capture, result: Result) -> Capture:
-    """Return the capture with the cameras and time offsets of the run, if the result has them."""
-    if result.cameras is None:
-        return capture
-    of_run = {
-        (camera.name, camera.width, camera.height): (camera, float(late))
-        for camera, late in zip(result.cameras.rig, result.cameras.time_offset_s, strict=True)
-    }
-    used = [
-        of_run.get((camera.name, camera.width, camera.height), (camera, late))
-        for camera, late in zip(capture.rig, capture.time_offset_s, strict=True)
-    ]
-    return replace(capture, rig=Rig(tuple(camera for camera, _ in used)), time_offset_s=tuple(late for _, late in used))
 
 
 def joined(tiles: Sequence[Image], axis: int) -> Image:

@@ -148,16 +148,23 @@ class Chart {
     return text;
   }
 
+  /** An area for each run of known values. */
   band({ values, sigma }) {
-    const upper = [], lower = [];
+    let text = "", upper = [], lower = [];
+    const end = () => {
+      if (upper.length) text += `M${[...upper, ...lower].join("L")}Z`;
+      upper = [];
+      lower = [];
+    };
     values.forEach((value, row) => {
-      if (!isFinite(value) || !isFinite(sigma[row])) return;
+      if (!isFinite(value) || !isFinite(sigma[row])) return end();
       const x = this.x(this.time[row]).toFixed(1);
       const clip = (y) => Math.min(Math.max(y, this.top), this.bottom).toFixed(1);
       upper.push(`${x} ${clip(this.y(value + sigma[row]))}`);
       lower.unshift(`${x} ${clip(this.y(value - sigma[row]))}`);
     });
-    return upper.length ? `M${[...upper, ...lower].join("L")}Z` : "";
+    end();
+    return text;
   }
 
   show(row) {

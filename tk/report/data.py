@@ -235,7 +235,7 @@ def _error_data(found: Evaluation, person: Result, positions: Float) -> dict[str
     groups |= {f"{len(LIMB_JOINTS)} limb joints": (found.raw.limbs, found.corrected.limbs)}
     groups |= {name: (found.raw.joints[name], found.corrected.joints[name]) for name in JOINTS}
     rows = [[name, *plain_values([raw.mean_cm, corrected.mean_cm])] for name, (raw, corrected) in groups.items()]
-    distances = np.linalg.norm(person.joints - positions, axis=-1)
+    distances = np.linalg.norm(person.in_joint_order().joints - positions, axis=-1)
     known = np.isfinite(distances)
     means = np.where(known, distances, 0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
     return {"rows": rows, "frames": packed(np.where(known.any(axis=1), 100 * means, np.nan))}

@@ -68,6 +68,11 @@ class Summary:
         """Number of frames with a pose that the residual contradicts."""
         return int((self.status == Status.SUSPECT).sum())
 
+    @property
+    def mostly_lost(self) -> bool:
+        """Whether more than half of the frames in which the person is present are lost or suspect."""
+        return 2 * (self.lost + self.suspect) > self.present
+
 
 def track(
     capture: Capture,

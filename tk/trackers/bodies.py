@@ -1,14 +1,15 @@
-"""Bodies of earlier recordings: from a result, or from a TOML file with dimensions."""
+"""What results were tracked with: bodies, also from a TOML file with dimensions, and cameras."""
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError, ResultError
+from tk.io.captures.capture import Capture
 from tk.io.results.data import Result
 from tk.io.results.reader import as_damage_error, read_result
 from tk.io.toml import parse_toml, read_text
@@ -16,6 +17,8 @@ from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.skeleton import convert_poses, skeleton_of_names
 from tk.model.body.stored_body import restore_body, restore_dimensions
+from tk.model.cameras.camera import Rig
+from tk.model.setup import AVERAGE_STATURE_M
 
 
 def read_body(path: Path, up: str) -> ConeBody:
@@ -40,7 +43,7 @@ def read_body(path: Path, up: str) -> ConeBody:
         raise ConfigError(f"{path}: {what}; a body has stature, or [dimensions], in metres")
     given = values.get("dimensions", {})
     known = {field.name for field in fields(BodyDimensions)}
-    stature = values.get("stature", 1.75)
+    stature = values.get("stature", AVERAGE_STATURE_M)
     numbers = {"stature": stature, **(given if isinstance(given, dict) else {"dimensions": given})}
     for name, value in numbers.items():
         if name != "stature" and name not in known:
@@ -72,3 +75,18 @@ def body_and_poses(result: Result) -> tuple[ConeBody, NDArray[np.float64]] | Non
     except ValueError as error:
         raise ResultError(f"{result.path}: /pose: {error}; track the capture again") from error
     return body, convert_poses(result.pose, own, body.skeleton)
+
+
+def as_tracked(capture: Capture, result: Result) -> Capture:
+    """Return the capture with the cameras and time offsets of the run, if the result has them."""
+    if result.cameras is None:
+        return capture
+    of_run = {
+        (camera.name, camera.width, camera.height): (camera, float(late))
+        for camera, late in zip(result.cameras.rig, result.cameras.time_offset_s, strict=True)
+    }
+    used = [
+        of_run.get((camera.name, camera.width, camera.height), (camera, late))
+        for camera, late in zip(capture.rig, capture.time_offset_s, strict=True)
+    ]
+    return replace(capture, rig=Rig(tuple(camera for camera, _ in used)), time_offset_s=tuple(late for _, late in used))

@@ -129,13 +129,16 @@ def follow_rotations(sequence: str, R: Float) -> Float:
     singular middle angle of ±90° only the sum or difference of the first and the last is determined well, and noise
     turns both by large, opposite angles. There, the change since the last frame is damped, at the expense of an error
     of the rotation (Nakamura & Hanafusa, J. Dyn. Syst. Meas. Control 108 (1986) 163-171, section 5). Everywhere else
-    the angles are exact.
+    the angles are exact. Frames that begin singular are first followed backward, so that they begin with the angles
+    that lead to the first exact ones.
     """
     axes = [np.eye(3)["xyz".index(axis)] for axis in sequence]
-    result = decompose(sequence, R)
-    last = np.zeros(3)
-    for f in range(len(result)):
-        angles = _nearest(result[f], last)
+    exact = decompose(sequence, R)
+    result, last = np.empty_like(exact), np.zeros(3)
+    regular = np.flatnonzero(np.abs(np.cos(exact[:, 1])) >= _NEAR_SINGULAR)
+    begin = int(regular[0]) if len(regular) else len(exact) - 1
+    for f in (*range(begin, 0, -1), *range(len(exact))):
+        angles = _nearest(exact[f], last)
         cosine = np.cos(angles[1])
         if abs(cosine) < _NEAR_SINGULAR:
             damping = _DAMPING**2 * (1 - (cosine / _NEAR_SINGULAR) ** 2)
