@@ -161,6 +161,15 @@ def test_recording_may_begin_with_level_arms(level: float, lowered: bool) -> Non
     np.testing.assert_allclose(found, angles, atol=4.0)
 
 
+def test_person_at_rest_has_constant_angles_from_the_first_frame() -> None:
+    """Arms 3° from level, which are then lowered past the singular direction."""
+    at_rest = np.repeat(compose("zxy", np.radians([[-50.0, -93.0, -40.0]])), 12, axis=0)
+    lowered = compose("zxy", np.radians([[0.0, -80.0 + 5 * f, 20.0] for f in range(12)]))
+    found = np.degrees(follow_rotations("zxy", np.concatenate([at_rest, lowered])))
+    np.testing.assert_allclose(found[:12], np.repeat([[-50.0, -93.0, -40.0]], 12, axis=0), atol=4.0)
+    np.testing.assert_allclose(found[13:], [[0.0, -80.0 + 5 * f, 20.0] for f in range(1, 12)], atol=4.0)
+
+
 def test_mot_angles_are_continuous(write: Write) -> None:
     motion, _ = read_motion(write())
     turning = {name: values for name, values in coordinates(motion).items() if not name.startswith("pelvis_t")}

@@ -14,7 +14,8 @@ _SINGULAR = 1e-7
 # to an error of the rotation. An arm held level to the side with 0.5° of noise then keeps its angles within 1° (without
 # damping they jump by 88°) at errors of up to 1°; with twice the weight, errors reach 3.5°.
 _NEAR_SINGULAR, _DAMPING = np.sin(np.radians(10.0)), 0.1
-# Gauss-Newton steps: enough to converge from the last frame's angles
+# Gauss-Newton steps: enough to converge from the last frame's angles. The first frame is followed so many times: its
+# damped changes then come to an end, unless it is within about a degree of the singularity.
 _DAMPED_STEPS = 20
 
 
@@ -129,15 +130,15 @@ def follow_rotations(sequence: str, R: Float) -> Float:
     singular middle angle of ±90° only the sum or difference of the first and the last is determined well, and noise
     turns both by large, opposite angles. There, the change since the last frame is damped, at the expense of an error
     of the rotation (Nakamura & Hanafusa, J. Dyn. Syst. Meas. Control 108 (1986) 163-171, section 5). Everywhere else
-    the angles are exact. Frames that begin singular are first followed backward, so that they begin with the angles
-    that lead to the first exact ones.
+    the angles are exact. If the first frame is near the singularity, its angles are found backward from the first exact
+    ones, and then converge, so that a person who begins at rest has constant angles.
     """
     axes = [np.eye(3)["xyz".index(axis)] for axis in sequence]
     exact = decompose(sequence, R)
     result, last = np.empty_like(exact), np.zeros(3)
     regular = np.flatnonzero(np.abs(np.cos(exact[:, 1])) >= _NEAR_SINGULAR)
     begin = int(regular[0]) if len(regular) else len(exact) - 1
-    for f in (*range(begin, 0, -1), *range(len(exact))):
+    for f in (*range(begin, 0, -1), *[0] * _DAMPED_STEPS, *range(len(exact))):
         angles = _nearest(exact[f], last)
         cosine = np.cos(angles[1])
         if abs(cosine) < _NEAR_SINGULAR:
