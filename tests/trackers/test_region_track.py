@@ -248,7 +248,7 @@ def test_a_result_of_the_silhouette_tracker_follows_the_contract_and_can_be_exte
     assert result.status.tolist() == [Status.INITIALISED] + [Status.TRACKED] * 4
     assert (result.pose.shape, result.iterations.shape) == ((5, 32), (5, 3))
     assert {"decode", "masks", "masks_clean", "optimise", "check", "total"} <= set(result.timing)
-    assert np.shape(result.model["parts/shape"]) == (22, 4)
+    assert np.shape(result.model["parts/shape"]) == (24, 4)
 
 
 def test_frames_without_anybody_are_counted_apart_and_not_changed_by_the_second_pass(
