@@ -18,11 +18,8 @@ def every(images: NDArray[Any], size: tuple[int, ...], step: int) -> NDArray[Any
     if size[0] == images.shape[1]:
         return images[:, step // 2 :: step, step // 2 :: step]
     rows, columns, flat = _places(size[0], size[1], *images.shape[1:3], step)
-    return (
-        images.reshape(len(images), -1, *images.shape[3:])
-        .take(flat, axis=1)
-        .reshape(-1, rows, columns, *images.shape[3:])
-    )
+    values = images.reshape(len(images), -1, *images.shape[3:]).take(flat, axis=1)
+    return values.reshape(-1, rows, columns, *images.shape[3:])
 
 
 @lru_cache(32)

@@ -90,8 +90,8 @@ class MaskStore:
         file.truncate(end)
 
     def _place(self, index: int, kind: int, place: tuple[int, int]) -> None:
-        """Note where a record is. A frame's masks are its last record: those before them that are older than the masks
-        of an earlier time belong to that time."""
+        """Note where a record is. If a frame's masks are stored again, its other records that are older than its former
+        masks are forgotten: each time a frame is stored, its masks are the last record."""
         before, _ = self._places.get((index, _PERSON), (-1, 0))
         if kind == _PERSON:
             for other in (_OTHERS, _COLORS):

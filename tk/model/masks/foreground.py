@@ -344,9 +344,8 @@ class CollinearityForeground:
         for c, inside in enumerate(self._windows):
             own = brighter[c, inside]
             middle = np.median(own)
-            least[c] = middle + _BRIGHT_DEVIATIONS * 1.4826 * np.median(
-                np.abs(own - middle)
-            )  # of a normal distribution
+            deviation = 1.4826 * np.median(np.abs(own - middle))  # of a normal distribution
+            least[c] = middle + _BRIGHT_DEVIATIONS * deviation
         return least
 
     def _decide(self, mosaic: Mosaic, prior: Prior | None, noise: NDArray[np.float32]) -> tuple[Images, Images]:
