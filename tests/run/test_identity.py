@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +26,7 @@ from tk.people.identity import (
     Contacts,
     doubtful,
     judge_contacts,
+    last_outcome,
     outcome_of,
     report,
     unmixed,
@@ -142,3 +145,22 @@ def test_nobody_tracked_is_in_no_contact() -> None:
     contacts = Contacts()
     judge_contacts(contacts, [], {})
     assert not contacts.all
+
+
+@pytest.mark.parametrize(
+    ("own", "lost", "outcome"), [(-0.1, False, KEPT), (-3.0, False, EXCHANGED), (-0.1, True, UNCLEAR)]
+)
+def test_contact_at_the_end_of_a_run_is_judged_in_the_last_frame(own: float, lost: bool, outcome: int) -> None:
+    """By the colours of both, if both are found there; the pelvises have been close."""
+
+    def person(number: int) -> Any:
+        def likeness(share: int, learned: object, pose: object) -> float:
+            return own if share == number else -1.0
+
+        sharing = SimpleNamespace(likeness=likeness, last_poses=lambda: (np.zeros(3), np.zeros(3)))
+        return SimpleNamespace(number=number, lost=lost and number == 1, sharing=sharing)
+
+    answers: Any = {n: SimpleNamespace(used=n) for n in (0, 1)}
+    contact = Contact((0, 1), 3, 9, 7, AT, shorter_m=-0.5, learned=(LEARNED, LEARNED))
+    assert last_outcome(contact, [person(0), person(1)], answers) == outcome
+    assert last_outcome(Contact((0, 1), 3, 9, 7, AT, outcome=KEPT), [], {}) == KEPT

@@ -127,11 +127,7 @@ def judge_contacts(contacts: Contacts, tracked: Sequence[Person], answers: Mappi
     frame = next(iter(answers.values())).share.index
     for contact in contacts.update(frame, pelvis, {n: person.sharing.learned() for n, person in here.items()}):
         pair = [here[number] for number in contact.people]
-        likeness = np.zeros((2, 2))
-        for i, one in enumerate(pair):
-            for j, other in enumerate(pair):
-                share, pose = answers[one.number].used, one.sharing.last_poses()[0]
-                likeness[i, j] = other.sharing.likeness(share, contact.learned[j], pose)
+        likeness = _likeness(contact, pair, answers)
         contact.outcome = outcome_of(likeness, contact.shorter_m)
         _LOG.debug("contact of %s, frames %d to %d: %s", contact.people, contact.first, contact.last, likeness)
         if contact.outcome == EXCHANGED:
@@ -140,6 +136,27 @@ def judge_contacts(contacts: Contacts, tracked: Sequence[Person], answers: Mappi
                 tracker: Any = state.tracker
                 person.state = replace(state, tracker=replace(tracker, colors=colors))
         contact.learned = ()
+
+
+def last_outcome(contact: Contact, tracked: Sequence[Person], answers: Mapping[int, Answer]) -> int:
+    """Return the outcome of a contact at the end of the run, arguments as for :func:`judge_contacts` and those of the
+    last frame; if it has not ended, the people are compared in that frame, in which both may be lost."""
+    if contact.outcome != OPEN:
+        return contact.outcome
+    here = {person.number: person for person in tracked if not person.lost and person.number in answers}
+    if not here.keys() >= set(contact.people):
+        return contact.without_comparison
+    return outcome_of(_likeness(contact, [here[n] for n in contact.people], answers), contact.shorter_m)
+
+
+def _likeness(contact: Contact, pair: Sequence[Person], answers: Mapping[int, Answer]) -> Float:
+    """Return (2, 2) the log-likelihood of trajectory i as person j of a contact."""
+    likeness = np.zeros((2, 2))
+    for i, one in enumerate(pair):
+        share, pose = answers[one.number].used, one.sharing.last_poses()[0]
+        for j, other in enumerate(pair):
+            likeness[i, j] = other.sharing.likeness(share, contact.learned[j], pose)
+    return likeness
 
 
 def outcome_of(likeness: Float, shorter_m: float) -> int:

@@ -35,7 +35,7 @@ from tk.model.setup import Setup, Subject
 from tk.people.choose import chosen, in_order, matched, unknown_subject
 from tk.people.find import LocatedPerson, PeopleFinder
 from tk.people.hulls import shares_by_hulls
-from tk.people.identity import EXCHANGED, OPEN, UNCLEAR, Contact, Contacts, judge_contacts
+from tk.people.identity import EXCHANGED, UNCLEAR, Contact, Contacts, judge_contacts, last_outcome
 from tk.people.person import Answer, Person, PersonState, no_pose
 from tk.people.share import PixelOwners, assign
 from tk.settings import Settings
@@ -90,6 +90,7 @@ class People:
         self._first, self._note = first, note
         self._tracked: list[Person] = []
         self._contacts = Contacts()
+        self._last: dict[int, Answer] = {}  # of the last frame
         self._every = max(1, round(LOOK_EVERY_S * setup.fps))
         self._unknown: deque[Frame] = deque(maxlen=INFORMATIVE_FRAMES)  # people who are unknown, in the last frames
         self._refused = 0  # consecutive people who could not be tracked
@@ -114,11 +115,11 @@ class People:
 
     @property
     def contacts(self) -> list[Contact]:
-        """The contacts of the people in the result. One that has not ended is judged by the pelvises alone. With
-        somebody who is not in the result, frames cannot be exchanged."""
+        """The contacts of the people in the result; one that has not ended is judged in the last frame. With somebody
+        who is not in the result, frames cannot be exchanged."""
         numbers, found = {person.number for person in self.written}, []
         for contact in self._contacts.all:
-            outcome = contact.without_comparison if contact.outcome == OPEN else contact.outcome
+            outcome = last_outcome(contact, self._tracked, self._last)
             if outcome == EXCHANGED and not numbers.issuperset(contact.people):
                 outcome = UNCLEAR
             if not numbers.isdisjoint(contact.people):
@@ -302,6 +303,7 @@ class People:
             without = np.empty((len(frame.masks), 0, 0, 3), np.uint8)  # images are views into the ring of frames
             self._unknown.append(replace(owners.unknown(fit), images=without))
         judge_contacts(self._contacts, self._tracked, answers)
+        self._last = dict(answers)
         answers |= self._look(fit, owners)
         for person in self._tracked:
             if person.absent:
