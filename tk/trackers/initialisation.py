@@ -51,9 +51,6 @@ FOLLOWED = 8
 # children's proportions and wide clothes need more. A visual hull that is lower by more than this shows a person who
 # bends, so its height is no estimate of the stature.
 MOST_STATURE_RATIO = 1.35
-# Standard deviation of the logarithm of the stature that one limb's landmarks show: 0.10 in 42 single frames of four
-# cameras, 0.09 with two.
-_LIMB_SPREAD = 0.1
 #: the joints that a limb search does not move
 TRUNK = [JOINTS.index(name) for name in ("pelvis", "neck", *SHOULDERS, *HIPS)]
 
@@ -217,21 +214,14 @@ def _follow(
     return [TrajectoryHypothesis(one, float(mean)) for one, mean in zip(poses, means, strict=True)]
 
 
-def _most_shown(statures: Float) -> float:
-    """Return the stature, metres, where the density of statures (K,) that limbs show is largest: limbs with a landmark
-    of somebody else may be more than half, but they do not agree."""
-    at = np.linspace(np.log(LEAST_STATURE), np.log(GREATEST_STATURE), 400)  # steps of 0.3 %
-    density = np.exp(-0.5 * ((at[:, None] - np.log(statures)) / _LIMB_SPREAD) ** 2).sum(axis=1)
-    return float(np.exp(at[density.argmax()]))
-
-
 def stature_of(finder: ContourFinder, pyramids: Sequence[Pyramid], hull_m: float | None = None) -> float:
     """Return the stature, metres, that frames show.
 
-    Landmarks show it in any pose: the stature that most limbs show in all frames. Without landmarks, it is the stature
-    at which an average body covers as many pixels as the silhouettes do: median over the views of all frames, against
-    the mean area of hanging and spread arms. The area hardly changes when a person bends or raises the arms. Clothes
-    enlarge it, raised arms enlarge the height of the visual hull; who bends has a low hull.
+    Landmarks show it in any pose; those of one frame do, the one in which they are most visible, because frames err
+    alike. Without landmarks, it is the stature at which an average body covers as many pixels as the silhouettes do:
+    median over the views of all frames, against the mean area of hanging and spread arms. The area hardly changes when
+    a person bends or raises the arms. Clothes enlarge it, raised arms enlarge the height of the visual hull; who bends
+    has a low hull.
 
     Args:
         finder: of the cameras.
@@ -239,10 +229,9 @@ def stature_of(finder: ContourFinder, pyramids: Sequence[Pyramid], hull_m: float
         hull_m: height of the visual hull in the first frame, metres, if known.
     """
     rig = finder.views.rig
-    marked = [pyramid.measured.get(landmark_cue.NAME) for pyramid in pyramids]
-    by_limb = [landmark_cue.statures(rig, seen) for seen in marked if seen is not None]
-    if by_limb and len(known := np.concatenate(by_limb)):
-        return _most_shown(known)
+    marked = [pyramid.measured[landmark_cue.NAME] for pyramid in pyramids if landmark_cue.NAME in pyramid.measured]
+    if marked and (shown := landmark_cue.stature(rig, max(marked, key=lambda seen: np.nansum(seen[..., 2])))):
+        return shown
     body: ConeBody = build_cone_body(AVERAGE_BODY)
     ratios: list[Float] = []
     for pyramid in pyramids:

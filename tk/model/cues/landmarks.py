@@ -25,14 +25,15 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from tk.kernels.cone_arrays import NEAREST_M
 from tk.kernels.landmark_terms import LandmarkArrays, landmark_costs, landmark_information
 from tk.kernels.mask_values import PERSON
-from tk.model.body.anthropometry import AVERAGE_BODY
+from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_points import LANDMARKS, POINTS, SEGMENT
-from tk.model.body.cone_body import ConeBody
-from tk.model.body.initial_pose import resting_figures
+from tk.model.body.cone_body import ConeBody, build_cone_body
+from tk.model.body.initial_pose import GREATEST_STATURE, LEAST_STATURE, resting_figures
 from tk.model.body.joints import HIPS, JOINTS, SHOULDERS, side_of
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.triangulation import triangulate_joints
@@ -61,9 +62,14 @@ ELSEWHERE = 0.02
 OFFSET_M = 0.02
 # Least visibility of landmarks whose box is compared with the box of a mask, and least overlap of both boxes.
 LEAST_VISIBLE, LEAST_OVERLAP = 0.2, 0.2
-# Factors of the standard deviations with which a proposal minimises the landmarks' cost, two steps each: a pose that
-# is far away is attracted, too. Largest change of an angle in a step, radians.
-WIDENED, LONGEST_STEP = (16.0, 8.0, 4.0, 2.0, 1.0), 0.6
+# Factors of the standard deviations with which a proposal minimises the landmarks' cost: a pose that is far away is
+# attracted, too. Steps with each. Largest change of an angle in a step, radians.
+WIDENED, STEPS, LONGEST_STEP = (16.0, 8.0, 4.0, 2.0, 1.0), 3, 0.6
+# Share of each diagonal element that is added to it at first, and the factor by which the share then changes.
+DAMPING, DAMPING_CHANGE = 0.01, 5.0
+# Statures from which the most likely one is searched for: 32 % apart, a pose that fits one is near that of its
+# neighbours.
+STATURES = 5
 # Weight of the landmarks in the contours' equations of a frame, see tk.model.cues.cue.
 WEIGHT = 5.0
 # Share of the landmarks' likelihood that counts: a network's errors in neighbouring landmarks go together.
@@ -118,14 +124,17 @@ class LandmarkCue:
         body: the person's body.
         seen: (V, L, 4) or (F, V, L, 4), x, y, pixels, visibility, and depth, metres behind the middle of the hips; NaN
             if unknown. Of F frames: as many as poses.
+        error_size: the landmarks' errors are those of a person so large as a multiple of the average one; None: of the
+            body's size.
     """
 
     weight = WEIGHT
 
-    def __init__(self, rig: Rig, body: ConeBody, seen: Float) -> None:
-        self._rig, self._body, self._seen = rig, body, seen
+    def __init__(self, rig: Rig, body: ConeBody, seen: Float, error_size: float | None = None) -> None:
+        self._rig, self.body, self._seen = rig, body, seen
         self._elsewhere, self._precision = ELSEWHERE, 1.0
-        self._size = size = body.dimensions.stature / AVERAGE_STATURE_M
+        actual = body.dimensions.stature / AVERAGE_STATURE_M
+        self._size = size = error_size or actual
         frames = seen.reshape(-1, *seen.shape[-3:])  # (F, V, L, 4)
         known = known_landmarks(frames)
         at = np.where(known[..., None], _normalised(rig, frames)[..., :2], 0.0)
@@ -142,7 +151,7 @@ class LandmarkCue:
             _HALF,
             _cameras(rig, at, visibility),
             np.stack([marks, marks[..., _PARTNER, :]], axis=2),
-            _depths(np.where(known, frames[..., 3], np.nan), visibility, size),
+            _depths(np.where(known, frames[..., 3], np.nan), visibility, actual, size),
             np.concatenate([offset, _SHARE**2 * (offset[:, _FROM] + offset[:, _TO])], axis=1),
         )
         self._arrays = LandmarkArrays._make(map(np.ascontiguousarray, values))
@@ -191,7 +200,7 @@ class LandmarkCue:
         Pose or landmark may be right, so half of the squared distance counts. Neck and pelvis have the mean of
         shoulders and hips, the crown that of the face.
         """
-        x = points(self._body, poses)
+        x = points(self.body, poses)
         each = np.broadcast_to(self._seen, (len(poses), *self._seen.shape[-3:]))
         known, found = known_landmarks(each), np.full(x.shape, np.nan)
         if (some := np.flatnonzero(known.any(axis=(1, 2)))).size:
@@ -223,13 +232,13 @@ def _cameras(rig: Rig, at: Float, visibility: Float) -> Float:
     return np.concatenate([np.broadcast_to(world, (*sight.shape[:2], 12)), sight], axis=2)
 
 
-def _depths(depth: Float, visibility: Float, size: float) -> Float:
+def _depths(depth: Float, visibility: Float, size: float, error_size: float) -> Float:
     """Return (F, V, 2, K, 3) depths of the bones, metres, probability of being right, and 1/variance, 1/m², as named,
-    and with left and right exchanged, from depth and visibility (F, V, L) of the landmarks."""
+    and with left and right exchanged, from depth and visibility (F, V, L) of the landmarks of an average person."""
     depth, visibility = (np.stack([v, v[..., _PARTNER]], axis=2) for v in (depth, visibility))
     seen = size * (depth[..., _TO] - depth[..., _FROM])
     known, visibility = np.isfinite(seen), np.minimum(visibility[..., _TO], visibility[..., _FROM])
-    sigma = DEPTH_M * size * DEPTH_HIDDEN ** (1.0 - visibility)
+    sigma = DEPTH_M * error_size * DEPTH_HIDDEN ** (1.0 - visibility)
     return np.stack([np.where(known, seen, 0.0), np.where(known, right_share(visibility), 0.0), sigma**-2], axis=-1)
 
 
@@ -282,31 +291,57 @@ def propose(rig: Rig, body: ConeBody, seen: Float, p_near: Float) -> Float:
     """Return poses (B, D) that landmarks (V, L, 4) of a frame show, the likeliest first.
 
     The landmarks' cost has several minima, such as a person who faces either way. It is minimised from figures at a
-    point (3,), by Gauss-Newton, at first with wide distributions.
+    point (3,), at first with wide distributions.
     """
-    skeleton = body.skeleton
-    start = resting_figures(skeleton, p_near)
-    prior = Quadratic.about(start, np.where(skeleton.prismatic, 1.0, np.pi) ** -2.0)
-    poses, cue = start, LandmarkCue(rig, body, seen)
+    poses, cost = _descended(LandmarkCue(rig, body, seen), resting_figures(body.skeleton, p_near))
+    return np.asarray(poses[np.argsort(cost, kind="stable")])
+
+
+def _descended(cue: LandmarkCue, rest: Float) -> tuple[Float, Float]:
+    """Return poses (B, D) that the landmarks attract from poses (B, D), and their costs (B,), nats.
+
+    Levenberg-Marquardt, with a weak prior about the first poses. Which landmarks are right, and whose left is left,
+    changes with the pose, so that full steps often lead uphill: they are not made, and the next ones are shorter.
+    """
+    skeleton = cue.body.skeleton
+    precision = np.where(skeleton.prismatic, 1.0, np.pi) ** -2.0
+    prior, poses = Quadratic.about(rest, precision), rest
     for factor in WIDENED:
-        cue = cue.widened(factor)
-        for _ in range(2):
-            cost = cue.normal(poses) + prior
-            step = np.linalg.solve(cost.matrix, cost.linear[..., None])[..., 0] - poses
-            poses = skeleton.clip(poses + np.clip(step, -LONGEST_STEP, LONGEST_STEP))
-    return np.asarray(poses[np.argsort(cue.cost(poses), kind="stable")])
+        wide, damping = cue.widened(factor), np.full(len(rest), DAMPING)
+        cost = wide.cost(poses) + 0.5 * (poses - rest) ** 2 @ precision
+        for _ in range(STEPS):
+            near = wide.normal(poses) + prior
+            stiff = near.matrix * (1.0 + damping[:, None, None] * np.eye(len(precision)))
+            step = np.linalg.solve(stiff, near.linear[..., None] - near.matrix @ poses[..., None])[..., 0]
+            tried = skeleton.clip(poses + np.clip(step, -LONGEST_STEP, LONGEST_STEP))
+            now = wide.cost(tried) + 0.5 * (tried - rest) ** 2 @ precision
+            lower = now < cost
+            poses, cost = np.where(lower[:, None], tried, poses), np.where(lower, now, cost)
+            damping = np.where(lower, damping / DAMPING_CHANGE, damping * DAMPING_CHANGE)
+    return poses, cue.cost(poses)
 
 
-def statures(rig: Rig, seen: Float) -> Float:
-    """Return (K,) the statures, metres, of average bodies with each upper arm, forearm, thigh and calf as long as
-    between the triangulated landmarks (V, L, 4) of a frame, of those that are known.
-
-    They do not depend on the pose, as a height does.
-    """
+def stature(rig: Rig, seen: Float) -> float | None:
+    """Return the stature, metres, of the average body that explains the landmarks (V, L, 4) of a frame best, each in
+    its best pose; None if no landmark is seen by two cameras. It does not depend on the pose, as a height does."""
     found = triangulate_joints(rig, seen)[0]
-    average = np.array([POINTS[name].place(AVERAGE_BODY) for name in LANDMARKS])
-    length, expected = (np.linalg.norm(x[_TO] - x[_FROM], axis=1)[_ACROSS:] for x in (found, average))
-    return np.asarray(AVERAGE_STATURE_M * (length / expected)[np.isfinite(length)])
+    if not np.isfinite(found).any():
+        return None
+    p_near = np.nanmedian(found, axis=0)
+
+    def explained(log_stature: float, rest: Float | None = None) -> tuple[float, Float]:
+        body = build_cone_body(BodyDimensions.from_stature(float(np.exp(log_stature))))
+        # the errors are those of a person of average stature: else smaller ones would make small bodies likelier
+        cue = LandmarkCue(rig, body, seen, error_size=1.0)
+        poses, cost = _descended(cue, resting_figures(body.skeleton, p_near) if rest is None else rest)
+        return float(cost.min()), poses[np.argsort(cost, kind="stable")[:2]]
+
+    sizes = np.linspace(np.log(LEAST_STATURE), np.log(GREATEST_STATURE), STATURES)
+    costs, poses = zip(*map(explained, sizes), strict=True)
+    best = int(np.argmin(costs))
+    bounds = sizes[max(best - 1, 0)], sizes[min(best + 1, len(sizes) - 1)]
+    nearest = minimize_scalar(lambda at: explained(at, poses[best])[0], bounds=bounds, options={"xatol": 0.01})
+    return float(np.exp(nearest.x))
 
 
 def points(body: ConeBody, pose: Float) -> Float:
