@@ -48,6 +48,7 @@ def test_good_capture_has_no_findings_and_gets_a_sheet(tk: Tk, tiny: Path, tmp_p
     sheet = cv2.imread(str(tmp_path / "sheets" / "inspect.png"))
     # a row of four cameras for each of three frames, below the text
     assert sheet.shape[0] > 900 and sheet.shape[1] > 1600
+    tk("inspect", tiny, "-o", tmp_path / "sheets").complaint("inspect.png", "exists", "--force")
 
 
 def test_turned_camera_is_named(tk: Tk, copy: Path) -> None:
