@@ -150,7 +150,7 @@ def test_camera_that_was_moved_after_its_empty_scene_is_named(tk: Tk, copy: Path
     clip.unlink()
     write_video(clip.with_suffix(".avi"), list(np.roll(background[1], 3, axis=2)))
     (first, *_) = json.loads(tk("inspect", copy, "--json").out)["findings"]
-    assert first.startswith("camera cam2 was moved, by 3 px, between its empty scene and the recording")
+    assert first.startswith("camera cam2 was moved or zoomed, by 3 px, between its empty scene and the recording")
 
 
 @pytest.mark.parametrize("named", [True, False])
