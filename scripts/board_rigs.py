@@ -106,7 +106,7 @@ def run(recipe: Recipe, board: Board, folder: Path) -> tuple[Errors, Verdict, fl
 
         rig = make_rig(recipe)
     begun = time.perf_counter()
-    done = calibrate(read_footage(folder, board, None, lambda _: None), board, Options(), lambda _: None)
+    done = calibrate(*read_footage(folder, board, None, lambda _: None), Options(), lambda _: None)
     seconds = time.perf_counter() - begun
     return compare(done.rig, true_world(rig, recipe, board)), judge(done), seconds
 

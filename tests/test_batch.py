@@ -104,7 +104,7 @@ def test_summary_lists_all_outcomes(tmp_path: Path) -> None:
         zip(
             [job.name for job in jobs],
             [
-                Outcome(DONE, 10, 6, 1, 10, 5.0, 2.345, 1.5, 0.031, 1.8, ("a note, with a comma",), mostly_lost=True),
+                Outcome(DONE, 10, 6, 1, 10, 5.0, 2.345, 1.5, 0.031, 1.8, ("a note, with a comma",), present=8),
                 Outcome(FAILED, failure="x.mp4: is cut off"),
                 Outcome(),
             ],
@@ -115,8 +115,8 @@ def test_summary_lists_all_outcomes(tmp_path: Path) -> None:
     with (tmp_path / "out" / "summary.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [row["state"] for row in rows] == ["mostly lost", "failed", "waiting"]
-    assert rows[0]["lost_percent"] == "60" and rows[0]["error_cm"] == "2.345" and rows[0]["frames_per_second"] == "2"
-    assert rows[0]["suspect"] == "1" and rows[0]["suspect_percent"] == "10"
+    assert rows[0]["lost_percent"] == "75" and rows[0]["error_cm"] == "2.345" and rows[0]["frames_per_second"] == "2"
+    assert rows[0]["suspect"] == "1" and rows[0]["suspect_percent"] == "12.5"
     assert rows[0]["notes"] == "a note, with a comma" and rows[1]["notes"] == "x.mp4: is cut off"
     assert {rows[2][name] for name in ("frames", "error_cm", "seconds")} == {""}
     page = (tmp_path / "out" / "summary.html").read_text(encoding="utf-8")
@@ -130,7 +130,7 @@ def test_summary_lists_all_outcomes(tmp_path: Path) -> None:
 def test_summary_lists_captures_of_earlier_calls(tmp_path: Path) -> None:
     ann, bob, out = folders(tmp_path / "ann", tmp_path / "bob", tmp_path / "out" / "jobs")
     earlier, now = make_jobs([ann, bob], out.parent, RecordingOptions())
-    earlier.write(Outcome(DONE, 20, 1, notes=("of yesterday",)))
+    earlier.write(Outcome(DONE, 20, 1, notes=("of yesterday",), present=20))
     now.write(Outcome(BEGUN))
     (out / ".bob.part.json").write_text("half writ")  # a worker writes its record meanwhile
     write_summary(out.parent, [now], {"bob": Outcome(DONE, 5)})
@@ -172,7 +172,7 @@ def test_absent_person_is_no_lost_one(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_exit_codes() -> None:
-    good, lost = Outcome(DONE, 10, 5), Outcome(DONE, 10, 6, mostly_lost=True)
+    good, lost = Outcome(DONE, 20, 5, present=10), Outcome(DONE, 20, 6, present=10)
     bad, defect = Outcome(FAILED, failure="no such file"), Outcome(FAILED, failure="a defect", trace="Traceback …")
     assert exit_code({"a": good}) == 0
     assert exit_code({"a": good, "b": lost}) == 3

@@ -68,7 +68,7 @@ def test_videos_of_the_board_are_read_like_pictures(tk: Tk, boards: Path, tmp_pa
     for camera in make_rig(RECIPE):
         assert abs(cameras[camera.name]["focal_px"] / camera.matrix[0, 0] - 1) < 0.02
         assert 6 <= cameras[camera.name]["views"] <= len(instants)
-    footages = read_footage(folder, BOARD, ["cam1"], lambda _: None)
+    footages, _ = read_footage(folder, BOARD, ["cam1"], lambda _: None)
     moving = [instant for instant, seen in footages[0].seen.items() if seen.motion_px > 8]
     assert len(moving) >= 5 and all(instant % 2 for instant in moving)
     # a capture that refers to the videos: cam1 has begun ten frames before cam2
@@ -78,7 +78,7 @@ def test_videos_of_the_board_are_read_like_pictures(tk: Tk, boards: Path, tmp_pa
     )
     (tmp_path / "cap" / "capture.toml").write_text(tables)
     notes: list[str] = []
-    first, second = read_footage(tmp_path / "cap", BOARD, None, lambda _: None, notes.append)
+    (first, second), _ = read_footage(tmp_path / "cap", BOARD, None, lambda _: None, notes.append)
     assert any("from 4.333 s to" in line for line in notes)
     assert [instant + 10 for instant in first.seen] == [instant for instant in footages[0].seen if instant >= 10]
     assert len(second.instants) == len(first.instants) == len(footages[0].instants) - 10

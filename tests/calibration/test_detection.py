@@ -65,6 +65,17 @@ def test_small_squares_are_exact(far_m: float) -> None:
     assert np.sqrt(((found.pixels - true[found.ids]) ** 2).sum(axis=1).mean()) < 0.08
 
 
+@pytest.mark.parametrize("printed", make_board("charuco", "7x6", 0.1).patterns)
+def test_charuco_board_of_any_version_of_opencv_is_found(printed: Board, tmp_path: Path) -> None:
+    grey, true = picture(printed)
+    (tmp_path / "a").mkdir()
+    cv2.imwrite(str(tmp_path / "a" / "0.png"), grey)
+    (footage,), board = read_footage(tmp_path, make_board("charuco", "7x6", 0.1), None, lambda _: None)
+    found = footage.seen[0].detection
+    assert board == printed and len(found.ids) > 20
+    np.testing.assert_allclose(found.pixels, true[found.ids], atol=0.3)
+
+
 def test_hidden_part_of_a_charuco_board_is_left_out() -> None:
     grey, true = picture(CHARUCO)
     x = int(true[:, 0].mean()) + 10
@@ -136,7 +147,7 @@ def test_videos_that_differ_by_a_frame_are_searched_at_the_same_instants(tmp_pat
         (tmp_path / name).mkdir()
         write_video(tmp_path / name / f"{name}.avi", np.zeros((count, 48, 64, 3), np.uint8))
         (tmp_path / name / f"._{name}.avi").write_bytes(b"of macOS")
-    a, b = read_footage(tmp_path, CHARUCO, None, lambda _: None)
+    (a, b), _ = read_footage(tmp_path, CHARUCO, None, lambda _: None)
     assert a.instants == b.instants[: len(a.instants)] and len(b.instants) - len(a.instants) <= 1
 
 

@@ -48,6 +48,7 @@ def test_good_capture_has_no_findings_and_gets_a_sheet(tk: Tk, tiny: Path, tmp_p
     sheet = cv2.imread(str(tmp_path / "sheets" / "inspect.png"))
     # a row of four cameras for each of three frames, below the text
     assert sheet.shape[0] > 900 and sheet.shape[1] > 1600
+    tk("inspect", tiny, "-o", tmp_path / "sheets").complaint("inspect.png", "exists", "--force")
 
 
 def test_turned_camera_is_named(tk: Tk, copy: Path) -> None:
@@ -149,7 +150,7 @@ def test_camera_that_was_moved_after_its_empty_scene_is_named(tk: Tk, copy: Path
     clip.unlink()
     write_video(clip.with_suffix(".avi"), list(np.roll(background[1], 3, axis=2)))
     (first, *_) = json.loads(tk("inspect", copy, "--json").out)["findings"]
-    assert first.startswith("camera cam2 was moved, by 3 px, between its empty scene and the recording")
+    assert first.startswith("camera cam2 was moved or zoomed, by 3 px, between its empty scene and the recording")
 
 
 @pytest.mark.parametrize("named", [True, False])

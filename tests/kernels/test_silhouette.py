@@ -447,21 +447,24 @@ def _border(
     window: ti.f64,
     scale: ti.f64,
     step: ti.f64,
+    width: ti.i32,
+    height: ti.i32,
     found: ti.types.ndarray(dtype=ti.f64, ndim=1),
 ):
     x, n = ti.Vector([start[0], start[1]]), ti.Vector([normal[0], normal[1]])
     for _ in range(1):
-        certainty, place = search_colors(image, likelihood, 0, 1.0 / step, x, n, window, scale, 0, 1)
+        certainty, place = search_colors(image, likelihood, 0, width, height, 1.0 / step, x, n, window, scale, 0, 1)
         found[0], found[1] = certainty, place
 
 
-def border(image, likelihood, start, normal, window=8.0, scale=1.0, step=1.0):
-    """(certainty, place in pixels of the scale) of the border between group 0 and group 1."""
+def border(image, likelihood, start, normal, window=8.0, scale=1.0, step=1.0, columns=None):
+    """(certainty, place in pixels of the scale) of the border between group 0 and group 1; ``columns``: of the image
+    without the padding beside it."""
     ensure_runtime()
     found = np.empty(2)
-    _border(
-        image[None], likelihood.astype(np.float32), np.array(start, float), np.array(normal), window, scale, step, found
-    )
+    height, width = (-int(-step * n // scale) for n in (len(image), columns or image.shape[1]))
+    start, normal = np.array(start, float), np.array(normal)
+    _border(image[None], likelihood.astype(np.float32), start, normal, window, scale, step, width, height, found)
     return found
 
 
@@ -504,6 +507,15 @@ def test_along_rows_and_columns_the_border_is_found_to_half_a_pixel(normal, offs
     image = np.where((along <= offset)[..., None], RED, BLUE).astype(np.uint8)
     certainty, found = border(image, two_colors(), (30, 30), normal)
     assert abs(found - (offset + 0.5)) < 0.25 and certainty > 0.8
+
+
+def test_padding_beside_a_smaller_image_shows_no_color():
+    """Beyond column 33 there is padding: whatever it contains, the search ends there."""
+    seen = [np.full((60, 60, 3), RED, np.uint8) for _ in range(2)]
+    seen[1][:, 34:] = BLUE
+    one, other = (border(image, two_colors(), (30, 30), (1.0, 0.0), columns=34) for image in seen)
+    np.testing.assert_array_equal(one, other)
+    assert border(seen[1], two_colors(), (30, 30), (1.0, 0.0))[1] == pytest.approx(3.5, abs=0.25)
 
 
 def test_equal_colors_give_no_border():

@@ -197,6 +197,7 @@ def test_sheets_are_written(result: Path, tmp_path: Path, tk: Tk) -> None:
     assert tk("render", result, DEMO, "--png", tmp_path / "out", "--full", "--frames", "1").code == 0
     whole = cv2.imread(str(tmp_path / "out" / "overlay-000001-000001.png"))
     assert whole.shape == (360, 5 * 480 + 4 * 6, 3)
+    tk("render", result, DEMO, "--png", tmp_path / "out").complaint("overlay-000000-000002.png", "exists", "--force")
 
 
 def test_lost_frames_are_marked_red(result: Path) -> None:

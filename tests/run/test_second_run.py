@@ -15,6 +15,7 @@ from tk.io.captures.mask_store import MaskStore
 from tk.model.setup import InitPose, Subject
 from tk.run.second_run import Run, shown_again, track_back
 from tk.settings import SilhouetteSettings
+from tk.trackers.judgement import STATES
 from tk.trackers.protocol import Estimate
 from tk.trackers.region import RegionTracker
 
@@ -23,6 +24,7 @@ POSES = walk(7)
 MASKS = draw_silhouettes(BODY, RIG, POSES)
 NOBODY = np.zeros_like(MASKS[0])
 CLOSE_M = 0.03
+WRONG, UNSEEN = STATES.index("wrong"), STATES.index("unseen")
 
 
 def tracked_back(
@@ -38,7 +40,8 @@ def tracked_back(
     is_lost = np.isin(np.arange(len(POSES)), lost)
     poses = np.where(is_lost[:, None], np.nan, POSES)
     residual = np.where(is_lost[:, None, None], np.nan, np.full((len(POSES), 3, 2), 0.02))
-    return track_back(Run(tracker, store, frames, poses, is_lost, residual), {})
+    states = np.where(is_lost[:, None], np.full(len(RIG), WRONG, np.uint8), 0)
+    return track_back(Run(tracker, store, frames, poses, is_lost, residual, states), {})
 
 
 @pytest.mark.parametrize("lost", [[0], [2, 3], [0, 1, 3]])
@@ -47,12 +50,15 @@ def test_the_person_is_found_from_the_frames_after_a_stretch(lost: list[int]) ->
     assert sorted(found) == [10 + row for row in lost]
     for number, estimate in found.items():
         assert errors(estimate, POSES[number - 10]).mean() < CLOSE_M
-        assert estimate.status == "tracked"
+        assert estimate.status == "tracked" and estimate.cameras is not None and not estimate.cameras.any()
 
 
 @pytest.mark.parametrize(("by", "found"), [(1, [1, 2, 3, 4]), (2, [3, 4]), (3, [3, 4])])
 def test_frames_before_one_that_fewer_than_two_cameras_see_stay_lost(by: int, found: list[int]) -> None:
-    assert sorted(tracked_back([1, 2, 3, 4], np.arange(7), unseen_in=2, by=by)) == found
+    estimates = tracked_back([1, 2, 3, 4], np.arange(7), unseen_in=2, by=by)
+    assert sorted(estimates) == found
+    if by == 1:
+        np.testing.assert_array_equal(estimates[2].cameras, [UNSEEN, 0, 0])
 
 
 def test_no_frame_is_tracked_over_a_gap_or_after_the_end() -> None:

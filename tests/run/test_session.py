@@ -188,14 +188,16 @@ def test_large_images_are_reduced_and_the_result_has_the_recorded_cameras(
 
 
 def test_lost_frames_of_all_runs_are_counted(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody is there in frames 3 to 5; the run is stopped in their midst."""
+    """Nobody is there in frames 3 to 5; the run is stopped in their midst, and after the last frame."""
     run_clock(monkeypatch, EVERY_FRAME)
     for camera in (copy / "masks").iterdir():
         for index in (3, 4, 5):
             write_picture(camera / f"{index:06d}.png", np.zeros((120, 160), np.uint8))
     result, capture = tmp_path / "r.h5", open_capture(copy)
     assert track(capture, result, CONFIG, StopAt(4), frames=(0, 9)).lost == 2
+    assert track(capture, result, CONFIG, StopAt(8), resume=True, frames=(0, 9)).interrupted
     assert track(capture, result, CONFIG, resume=True, frames=(0, 9)).lost == 3
+    assert read_result(result).notes == ("fewer than two cameras see anybody: no pose, frames 3 to 5",)
     status = read_result(result).status
     assert list(status[:3]) == [Status.INITIALISED, Status.TRACKED, Status.TRACKED]
     assert list(status[3:7]) == [Status.LOST, Status.LOST, Status.LOST, Status.RECOVERED]

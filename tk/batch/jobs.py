@@ -67,7 +67,12 @@ class Outcome:
     notes: tuple[str, ...] = ()  # notes of the run
     failure: str = ""  # reason of a failure, in one line
     trace: str = ""  # traceback of a defect; empty if the input is the reason
-    mostly_lost: bool = False  # whether more than half of the frames with the person are lost or suspect
+    present: int = 0  # number of frames in the result in which the person is present
+
+    @property
+    def mostly_lost(self) -> bool:
+        """Whether more than half of the frames in which the person is present are lost or suspect."""
+        return 2 * (self.lost + self.suspect) > self.present
 
     @property
     def failed(self) -> bool:

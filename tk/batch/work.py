@@ -84,7 +84,7 @@ def _track(job: Job, reporter: _Reporter) -> Outcome:
         frames=summary.frames,
         lost=summary.lost,
         suspect=summary.suspect,
-        mostly_lost=summary.mostly_lost,
+        present=summary.present,
         tracked_now=summary.tracked_now,
         error_cm=error_cm,
         limbs_cm=limbs_cm,

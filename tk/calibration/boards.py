@@ -55,6 +55,7 @@ class Board:
     square_m: float  # side of a square or a tag; distance between two rows of circles
     marker: float = _MARKER  # charuco: side of a marker, as a share of the square's; aprilgrid: the gap, of the tag's
     dictionary: str = "4x4_50"  # charuco, aprilgrid: the markers
+    legacy: bool = False  # charuco: with an even number of rows, as OpenCV before 4.6: the upper left square is white
 
     @property
     def title(self) -> str:
@@ -117,7 +118,16 @@ class Board:
     def charuco(self) -> Any:
         """OpenCV's ChArUco board."""
         size = (self.columns, self.rows)
-        return cv2.aruco.CharucoBoard(size, self.square_m, self.marker * self.square_m, self.markers)
+        board = cv2.aruco.CharucoBoard(size, self.square_m, self.marker * self.square_m, self.markers)
+        board.setLegacyPattern(self.legacy)
+        return board
+
+    @property
+    def patterns(self) -> tuple[Board, ...]:
+        """The boards that this one may be: versions of OpenCV differ in charuco boards with an even number of rows."""
+        if self.kind == "charuco" and self.rows % 2 == 0:
+            return self, replace(self, legacy=not self.legacy)
+        return (self,)
 
     def shapes(self) -> list[Shape]:
         """Return the black shapes of the board."""

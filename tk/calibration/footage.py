@@ -122,8 +122,11 @@ def read_footage(
     cameras: Sequence[str] | None,
     progress: Callable[[str], None],
     note: Callable[[str], None] = lambda _: None,
-) -> list[Footage]:
+) -> tuple[list[Footage], Board]:
     """Find the board in the images of all cameras. ``note`` receives lines for the user.
+
+    Returns:
+        what the cameras recorded, and the board: that of its patterns which is found first.
 
     Raises:
         CalibrationError, VideoError: a camera's images cannot be read, or a name is unknown.
@@ -140,11 +143,16 @@ def read_footage(
             found.append(Footage(name, path, clip=clip))
     longest = max((footage.clip.frame_count for footage in found if footage.clip), default=0)
     step = max(1, -(-longest // _LOOKS))  # of all cameras, so that their instants are the same
+    patterns = board.patterns
     for footage in found:
         progress(f"searching for the board in {footage.path}")
         for instant, grey, following in _images(footage, step):
-            _look(footage, board, instant, grey, following)
-    return found
+            detections = [(pattern, detect(grey, pattern)) for pattern in patterns]
+            shown, seen = max(detections, key=lambda one: 0 if one[1] is None else len(one[1].ids))
+            if seen is not None:
+                patterns = (shown,)
+            _look(footage, shown, instant, grey, following, seen)
+    return found, patterns[0]
 
 
 def _images(footage: Footage, step: int) -> Iterator[tuple[int, Grey, Grey | None]]:
@@ -191,9 +199,10 @@ def _grey(picture: NDArray[Any]) -> Grey:
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
-def _look(footage: Footage, board: Board, instant: int, grey: Grey, following: Grey | None) -> None:
+def _look(
+    footage: Footage, board: Board, instant: int, grey: Grey, following: Grey | None, found: Detection | None
+) -> None:
     footage.instants.append(instant)
-    found = detect(grey, board)
     if found is None:
         if len(footage.seen) < FEWEST_SEEN and len(footage.instants) % footage.spacing == 0:
             footage.samples.append(grey.copy())

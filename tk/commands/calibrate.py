@@ -150,7 +150,7 @@ def _calibrate(folder: Path, given: dict[str, Any]) -> None:
         options = Options(
             given["model"], given["instants"] or MOST_INSTANTS, given["floor"], read_intrinsics(given["intrinsics"])
         )
-        footages = read_footage(folder, board, given["cameras"], reporter.stage, reporter.note)
+        footages, board = read_footage(folder, board, given["cameras"], reporter.stage, reporter.note)
         with one_thread():
             done = calibrate(footages, board, options, reporter.stage)
             verdict = judge(done)

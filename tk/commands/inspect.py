@@ -19,6 +19,7 @@ from tk.errors import CaptureError
 @base.masks_option
 @base.resample_option
 @base.config_option
+@base.force_option
 @base.json_option
 def inspect(
     capture: Path,
@@ -27,27 +28,28 @@ def inspect(
     masks: str,
     resample: bool | None,
     config_file: Path | None,
+    force: bool,
     as_json: bool,
 ) -> None:
     """Check CAPTURE before tracking: masks, inconsistent or unsynchronised cameras, working volume, floor, up."""
-    sheet, plan = (None, None) if output is None else (output / "inspect.png", output / "people.png")
+    pictures = [] if output is None else [output / "inspect.png", output / "people.png"]
     with base.working(f"inspecting {capture}"):
         from tk.inspection.checks import inspect as check
         from tk.inspection.floor_plan import floor_plan
         from tk.inspection.pictures import write_sheet
         from tk.io.importers import open_recording
-        from tk.io.paths import check_not_input
+        from tk.io.paths import PNG, check_files
         from tk.render.canvas import write_png
         from tk.run.plan import reduce_images
 
-        for picture in (sheet, plan):
-            if picture is not None:
-                check_not_input(picture, capture=capture)
+        if output is not None:
+            check_files(output, pictures, PNG, force, capture=capture, error=CaptureError)
         settings = base.load_settings(config_file, resample=resample)
         opened = open_recording(capture, cameras, masks, settings.resample)
         opened = reduce_images(opened, settings.person_pixels)
         found, shown = check(opened, settings)
-        if sheet is not None and plan is not None:
+        if output is not None:
+            sheet, plan = pictures
             write_sheet(sheet, opened, found, shown)
             write_png(plan, floor_plan(opened, found.people), CaptureError)
             click.echo(f"wrote {sheet} and {plan}", err=True)

@@ -45,7 +45,7 @@ def render(
     """Draw RESULT.h5 as a video: over the images of CAPTURE, or in 3D."""
     with base.working("drawing"):
         from tk.io.captures.capture import open_capture
-        from tk.io.paths import check_not_input, check_output
+        from tk.io.paths import check_output
         from tk.io.results.reader import read_result
         from tk.render.overlay import Overlay, write_sheets
         from tk.render.scene import Scene
@@ -61,9 +61,7 @@ def render(
         if png is not None and (view != "overlay" or opened is None):
             raise ConfigError("--png: contact sheets need images; give RESULT.h5 CAPTURE and no other --view")
         output = output or result.with_name(result.stem + (".mp4" if view == "overlay" else f"-{view}.mp4"))
-        if png is not None:
-            check_not_input(png, [result], capture)
-        else:
+        if png is None:
             check_output(output, VIDEO, force, [result], capture)
             check_encoder()
         if view == "overlay" and opened is None:
@@ -80,7 +78,7 @@ def render(
                     shown = overlay.pictures(overlay.people.chosen(chosen))
                     images = (overlay.mosaic(frame, seen) for frame, seen in shown)
                 else:
-                    files = write_sheets(overlay, png, chosen, full=full)
+                    files = write_sheets(overlay, png, chosen, full, force)
             if png is None:
                 with video_writer(output, fps) as add:
                     for image in images:

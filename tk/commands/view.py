@@ -22,7 +22,7 @@ def view(result: Path, capture: Path | None, frame: int | None, screenshot: Path
     CAPTURE adds its cameras, if the result has none, and its ground truth, if it has one.
     """
     from tk.io.captures.capture import open_capture
-    from tk.io.paths import Kind, check_output, looks_like
+    from tk.io.paths import PNG, check_output
     from tk.io.results.reader import read_result, truth_of
     from tk.render.people import People
     from tk.view.contents import Contents
@@ -36,8 +36,7 @@ def view(result: Path, capture: Path | None, frame: int | None, screenshot: Path
     if frame is not None and frame not in known:
         raise ConfigError(f"--frame {frame}: the result has frames {min(known)} to {max(known)}")
     if screenshot is not None:
-        kind = Kind("an image", (".png",), looks_like(rb"\x89PNG"))
-        check_output(screenshot, kind, force, [result], capture)
+        check_output(screenshot, PNG, force, [result], capture)
     rig = loaded.cameras.rig if loaded.cameras else None
     truth = None
     if capture is not None:

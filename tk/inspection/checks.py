@@ -255,8 +255,8 @@ def _moved_since_empty(
         moved = shift_between(empty[0], image[:h, :w], mask[:h, :w])
         if moved > MOST_SHIFT:
             lines.append(
-                f"camera {camera.name} was moved, by {moved * max(h, w):.0f} px, between its empty scene and the "
-                "recording: record the empty scene again, and calibrate again if that was done before the move"
+                f"camera {camera.name} was moved or zoomed, by {moved * max(h, w):.0f} px, between its empty scene and "
+                "the recording: record the empty scene again, and calibrate again if that was done before the move"
             )
     return lines
 

@@ -90,6 +90,22 @@ def check_output(
     return target
 
 
+def check_files(
+    folder: Path,
+    files: Iterable[Path],
+    kind: Kind,
+    force: bool = False,
+    inputs: Iterable[Path | None] = (),
+    capture: Path | None = None,
+    error: type[TkError] = ExportError,
+) -> None:
+    """Check files that a command writes into a folder, which need not exist; see :func:`check_output`."""
+    check_not_input(folder, inputs, capture)
+    for file in files:
+        if file.exists():
+            check_output(file, kind, force, inputs, capture, error)
+
+
 def check_not_input(path: Path, inputs: Iterable[Path | None] = (), capture: Path | None = None) -> Path:
     """Return the path with links resolved, if it is not an input and does not lie in one; arguments as of
     :func:`check_output`.
@@ -125,6 +141,10 @@ def referred_files(capture: Path) -> list[Path]:
     given = [table.get("path") for table in tables if isinstance(table, dict)]
     paths = [path for own in given for path in (own if isinstance(own, list) else [own])]
     return [capture / path for path in paths if isinstance(path, str)]
+
+
+#: an image that tk writes
+PNG = Kind("an image", (".png",), looks_like(rb"\x89PNG"))
 
 
 @contextlib.contextmanager

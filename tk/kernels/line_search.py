@@ -122,21 +122,26 @@ def color_bin(image: ti.template(), v: int, j: int, i: int):
 
 
 @ti.func
-def search_colors(image: ti.template(), likelihood: ti.template(), v: int, ratio, x, n, window, scale, front, back):
+def search_colors(
+    image: ti.template(), likelihood: ti.template(), v: int, width: int, height: int, ratio, x, n, window, scale, front,
+    back,
+):  # fmt: skip
     """Return (certainty in [0, 1], mean place) of the border between two colour groups on the line x + s n.
 
     The border lies behind step d with a probability proportional to the exponential of the summed log ratios of the
     pixels before it (Stoiber et al. 2022, eqs. 3-8 with a hard step). Its mean is the Newton step; its variance,
-    relative to a uniform distribution's, gives the weight. ``ratio``: size of the image to that of the camera.
+    relative to a uniform distribution's, gives the weight. ``width``, ``height``: of the camera's image, in pixels of
+    the scale. ``ratio``: size of the image to that of the camera.
     """
     log_sum = 0.0 * window
     total, first, second = 1.0 + 0.0 * window, -(window + 0.5), (window + 0.5) ** 2
     reach = ti.cast(window, ti.i32)
+    at = (x + 0.5) / scale - 0.5
     start, along = (x + 0.5) * ratio - 0.5, (scale * ratio) * n
     for k in range(-reach, reach + 1):
         place = start + k * along
         i, j = ti.cast(ti.round(place[0]), ti.i32), ti.cast(ti.round(place[1]), ti.i32)
-        if i >= 0 and j >= 0 and i < image.shape[2] and j < image.shape[1]:
+        if in_picture(width, height, at + k * n) and i < image.shape[2] and j < image.shape[1]:
             bin = color_bin(image, v, j, i)
             log_ratio = likelihood[front, bin] - likelihood[back, bin]
             log_sum += ti.min(ti.max(log_ratio, -MOST_LOG_RATIO), MOST_LOG_RATIO) / _ALIKE_PIXELS

@@ -231,7 +231,7 @@ def search_contours(
                     other_limb = parts[behind, PART_LIMB] != parts[p, PART_LIMB]
                     if numbers[COLORS] > 0.0 and other_limb and front != back:
                         certainty, place = search_colors(
-                            image, likelihood, v, numbers[RATIO], pixel, n, window, scale, front, back
+                            image, likelihood, v, width, height, numbers[RATIO], pixel, n, window, scale, front, back
                         )
                         found, d, weight = 2, place * scale, share * numbers[COLORS] * certainty
                 elif use:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from tk.errors import ResultError
 from tk.io.captures.capture import Capture
+from tk.io.paths import PNG, check_files
 from tk.io.results.data import Result
 from tk.io.results.reader import truth_of
 from tk.model.cameras.camera import Camera, Rig
@@ -261,16 +263,15 @@ def joined(tiles: Sequence[Image], axis: int) -> Image:
     return np.concatenate(parts, axis=axis)
 
 
-def write_sheets(overlay: Overlay, folder: Path, frames: Sequence[int] = (), full: bool = False) -> list[Path]:
+def write_sheets(
+    overlay: Overlay, folder: Path, frames: Sequence[int] = (), full: bool = False, force: bool = False
+) -> list[Path]:
     """Write contact sheets of four frames each as PNG, one column per camera; eight frames by default."""
     chosen = overlay.people.chosen(frames, count=8)
-    written: list[Path] = []
-    sheet: list[tuple[int, Image]] = []
-    for frame, images in overlay.pictures(chosen):
-        sheet.append((frame, overlay.sheet_row(frame, images, full=full)))
-        if len(sheet) == _SHEET_ROWS or frame == chosen[-1]:
-            path = folder / f"overlay-{sheet[0][0]:06d}-{sheet[-1][0]:06d}.png"
-            write_png(path, joined([image for _, image in sheet], axis=0))
-            written.append(path)
-            sheet = []
-    return written
+    sheets = [chosen[i : i + _SHEET_ROWS] for i in range(0, len(chosen), _SHEET_ROWS)]
+    paths = [folder / f"overlay-{sheet[0]:06d}-{sheet[-1]:06d}.png" for sheet in sheets]
+    check_files(folder, paths, PNG, force, [overlay.people.first.path], overlay.capture.path)
+    rows = (overlay.sheet_row(frame, images, full=full) for frame, images in overlay.pictures(chosen))
+    for path, sheet in zip(paths, sheets, strict=True):
+        write_png(path, joined(list(islice(rows, len(sheet))), axis=0))
+    return paths

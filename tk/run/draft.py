@@ -73,8 +73,7 @@ class Draft:
             columns["evidence/reason"][row], columns["evidence/found"][row] = e.reason, e.found
             if e.modes is not None and modes is not None:
                 modes[row] = e.modes
-            if e.cameras is not None:  # else those of the first pass were left out
-                columns["evidence/camera"][row] = e.cameras
+            columns["evidence/camera"][row] = e.cameras
             if columns["evidence/origin"][row] != Status.INITIALISED:
                 columns["evidence/origin"][row] = e.origin
             self.lost[row] = e.status == "lost"

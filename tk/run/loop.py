@@ -187,9 +187,12 @@ class Loop:
         return fewer
 
     def restore_unfinished(self, path: Path) -> bool:
-        """Restore the trackers if all frames are written but the result is not finished; return whether that is so."""
+        """Restore the trackers if all frames are written but the result is not finished; return whether that is so.
+
+        Without segments, a result has no trace of its end, which adds notes only: they are written once more.
+        """
         output, tracker = self.output, self.plan.tracker
-        if output is None or not output.done or not tracker.has_segments:
+        if output is None or not output.done:
             return False
         one_pass = self.plan.task.options.causal or not tracker.has_second_pass
         results = zip(output.writer.models, read_result(path).people, strict=True)

@@ -28,12 +28,12 @@ from tk.run.delays import COMPARED, retimed, retimed_measured
 from tk.run.draft import Draft, held, without_absent
 from tk.run.prefetch import open_observations
 from tk.run.refinement import compare_cameras, refine_if_inconsistent
-from tk.run.second_run import Run, explains_better, shown_again, track_again, track_back
+from tk.run.second_run import Run, explains_better, shown_again, step_without, track_again, track_back
 from tk.run.task import Task
 from tk.trackers.headings import both_headings, trajectory_cost, turned_pose
 from tk.trackers.hypotheses import DROPPED
 from tk.trackers.judgement import FrameEvidence, FrameJudge, depth_known, judge_frames
-from tk.trackers.protocol import Estimate, two_pass, usable
+from tk.trackers.protocol import Estimate, two_pass
 from tk.trackers.reason import Reason, known_sigma, report_frames, status_of
 from tk.trackers.region import RegionTracker
 from tk.trackers.residual import mean_error
@@ -290,7 +290,7 @@ class _Finisher:
         with source.frames(int(numbers[0]), int(numbers[-1]) + 1) as images:
             frames = shown_again(images, numbers, masks, self._landmarks(draft, self.late))
             for frame, row in zip(frames, present.tolist(), strict=True):
-                estimate = tracker.step(usable(frame, unused[row]))
+                estimate = step_without(tracker, frame, unused[row], draft.current("evidence/camera")[row])
                 found.append(judge.judge(frame.index, estimate).light)
                 self.within(len(found) / len(present))
         again = draft.copy()

@@ -8,7 +8,7 @@ from pathlib import Path
 from tk.errors import ConfigError, ResultError
 from tk.io.captures.capture import Capture
 from tk.io.mesh import hull_mesh
-from tk.io.paths import check_not_input, check_output
+from tk.io.paths import check_files
 from tk.io.point_cloud import PLY, check_hull_path, ply_path, write_hulls, write_ply
 from tk.io.results.data import HullPoints
 from tk.model.cameras.volume import VoxelGrid
@@ -49,18 +49,15 @@ def reconstruct(
         TkError: bad input; every frame finished before it is in the file.
     """
     check_hull_path(output, force, capture.path)
-    for folder in (ply, mesh):
-        if folder is not None:
-            check_not_input(folder, capture=capture.path)
     for warning in capture.warnings:
         reporter.note(warning)
     start, stop = choose_frames(capture, frames, reporter.note)
     if ply is not None and mesh is not None and ply.resolve() == mesh.resolve():
         raise ConfigError(f"{ply}: is the folder of point clouds and of meshes; give each a folder of its own")
-    files = [ply_path(folder, frame) for folder in (ply, mesh) if folder is not None for frame in range(start, stop)]
-    for file in files:
-        if file.exists():
-            check_output(file, PLY, force, capture=capture.path, error=ResultError)
+    for folder in (ply, mesh):
+        if folder is not None:
+            files = [ply_path(folder, frame) for frame in range(start, stop)]
+            check_files(folder, files, PLY, force, capture=capture.path, error=ResultError)
     label = make_labeller(Task.of(capture, config), reporter.note)
     hull = VisualHull(capture.rig, VoxelGrid.cover(capture.volume, config.voxels))
     reporter.begin(stop - start, 0)

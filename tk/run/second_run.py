@@ -28,7 +28,7 @@ from tk.model.setup import InitPose, Setup, Subject
 from tk.run.delays import COMPARED
 from tk.trackers.camera_monitor import CameraMonitor
 from tk.trackers.contour_finder import COARSE_ROWS
-from tk.trackers.judgement import FrameJudge
+from tk.trackers.judgement import FrameJudge, all_left_out
 from tk.trackers.protocol import Estimate, Frame, shows_person, usable
 from tk.trackers.reason import is_lost
 from tk.trackers.region import RegionTracker
@@ -65,6 +65,7 @@ class Run:
         poses: (F, D) in the setup's world.
         lost: (F,) frames without a pose.
         residual: (F, C, 2), NaN for a camera that was left out.
+        cameras: (F, C) states of the cameras, indices in :data:`~tk.trackers.judgement.STATES`.
     """
 
     tracker: RegionTracker
@@ -73,12 +74,13 @@ class Run:
     poses: Float
     lost: NDArray[np.bool_]
     residual: Float
+    cameras: NDArray[np.uint8]
 
     @classmethod
     def of(cls, used: TrackerAndMasks, frames: NDArray[np.int64], found: Found, rows: NDArray[np.int64]) -> Run:
         """Return some rows of what a run has found in frames (F,)."""
-        pose, residual = (found.current(dataset)[rows] for dataset in ("pose", "residual"))
-        return cls(*used, frames[rows], pose, found.lost[rows], residual)
+        pose, residual, cameras = (found.current(name)[rows] for name in ("pose", "residual", "evidence/camera"))
+        return cls(*used, frames[rows], pose, found.lost[rows], residual, cameras)
 
     def left_out(self) -> NDArray[np.bool_]:
         """Return (C,) the cameras that show the person and were left out of a part of the frames."""
@@ -188,6 +190,16 @@ def shown_again(
             yield Frame(n, frame.halved, masks.get(n), time=frame.time, landmarks=marked)
 
 
+def step_without(
+    tracker: RegionTracker, frame: Frame, unused: NDArray[np.bool_], states: NDArray[np.uint8]
+) -> Estimate:
+    """Track a frame without the cameras (C,) that are unused; the estimate has the states of the cameras, those (C,)
+    given for unused ones."""
+    used = usable(frame, unused)
+    estimate = tracker.step(used)
+    return replace(estimate, cameras=all_left_out(np.where(unused, states, 0), shows_person(used.masks), estimate))
+
+
 def track_back(run: Run, landmarks: Mapping[int, Float]) -> dict[int, Estimate]:
     """Track each stretch of lost frames backwards, from the frames after it on, to the first frame in which the person
     is not found; return the estimates of those in which the person is found, by frame.
@@ -216,8 +228,9 @@ def track_back(run: Run, landmarks: Mapping[int, Float]) -> dict[int, Estimate]:
                 masks, marked = run.masks.get(number), landmarks.get(number)
                 blank = np.empty((len(masks), 0, 0, 3), np.uint8)
                 frame = Frame(number, blank, masks, landmarks=None if marked is None else marked[None])
-                unused = np.isnan(run.residual[after[0] if lost[row] else row, :, 0])
-                estimate = judge.judge(number, tracker.step(usable(frame, unused)))
+                known = after[0] if lost[row] else row
+                estimate = step_without(tracker, frame, np.isnan(run.residual[known, :, 0]), run.cameras[known])
+                estimate = judge.judge(number, estimate)
                 if is_lost(estimate.reason):
                     break
                 if lost[row]:

@@ -361,13 +361,13 @@ def test_opencv_names_of_digits_stay_as_they_are(folder: Path) -> None:
     assert read_project(folder).rig.names == ("00120", "00121", "00122", "00123")
 
 
-def test_opencv_cameras_of_one_name_are_refused(folder: Path) -> None:
-    for camera in make_rig():
+def test_opencv_files_with_one_camera_name_are_named_by_their_files(folder: Path, check: Import) -> None:
+    rig = make_rig()
+    for camera in rig:
         text = storage_text(opencv_values(camera), ".yml") + "camera_name: narrow_stereo\n"
         (folder / f"{camera.name}.yml").write_text(text)
     clips(folder)
-    with refused(CalibrationError, "two cameras have the name 'narrow_stereo'", folder):
-        read_project(folder)
+    check(folder, rig, tolerance_px=EXACT_PX)
 
 
 def test_opencv_intrinsics_alone_are_refused(folder: Path) -> None:

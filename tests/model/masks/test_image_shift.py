@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from scripts.fault_kinds import zoomed
 from tk.model.masks.image_shift import ImageShift, exchanged_scenes
 
 H, W = 240, 320
@@ -41,6 +42,13 @@ def measured(now: np.ndarray, of: np.ndarray, count: int = 1) -> float:
 def test_shift_is_measured_to_a_fifth_of_a_pixel(shift: tuple[float, float], gain: float) -> None:
     now = view(shift, person=20, gain=gain, seed=1)
     assert measured(now, mask(20)) == pytest.approx(np.hypot(*shift), abs=0.2)
+
+
+@pytest.mark.parametrize("zoom", [1.02, 1.2, 0.85])
+def test_zoom_moves_the_image_by_the_mean_over_its_pixels(zoom: float) -> None:
+    now = zoomed(view(person=20, seed=1), zoom)
+    away = abs(zoom - 1) * np.hypot(W, H) / np.sqrt(12)
+    assert measured(now, zoomed(mask(20), zoom)) == pytest.approx(away, abs=0.05 * away + 0.3)
 
 
 def test_person_and_what_moves_beside_do_not_move_the_image() -> None:

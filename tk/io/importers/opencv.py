@@ -10,6 +10,7 @@ but at one place with the inverse, they are taken for the camera's own pose. Len
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -58,11 +59,16 @@ def _read(files: Sequence[Path]) -> Tables:
 
 
 def _cameras(documents: Sequence[tuple[Path, Mapping[str, Any]]]) -> Iterator[tuple[Path, str, Table | None]]:
-    """Yield file, name and table of each camera: a file's own, or those in it; no table for a file without any."""
+    """Yield file, name and table of each camera: a file's own, or those in it; no table for a file without any.
+
+    A file's `camera_name` counts if no other file has the same, as a default of the program that wrote them.
+    """
+    given = Counter(str(document.get("camera_name")) for _, document in documents)
     for path, document in documents:
         whole = Table(document, str(path), CalibrationError)
         if _entry(whole, _MATRIX):
-            yield path, str(document.get("camera_name") or path.stem), whole
+            name = str(document.get("camera_name") or path.stem)
+            yield path, path.stem if given[name] > 1 else name, whole
             continue
         inside = document.get("cameras", document)
         listed = (

@@ -1,4 +1,5 @@
-"""Cameras that show nothing, stand still while the others see movement, or have been moved; masks of other images."""
+"""Cameras that show nothing, stand still while the others see movement, or have been moved or zoomed; masks of other
+images."""
 
 from __future__ import annotations
 
@@ -26,8 +27,8 @@ _SAME_LEVELS, _SAME_SHARE = 6, 0.001
 # Change of another camera's mask, as a share of its area, that shows movement.
 _MOVED = 0.15
 
-# A camera has been moved if its image has, by more than this share of its longer side: 0.3° with a lens of 60°. The
-# images of the correct cameras of fifteen captures seem to move by 0.15 %, because of shadows.
+# A camera has been moved if its image has, by more than this share of its longer side: 0.3° with a lens of 60°, or a
+# zoom by 1.4 %. The images of the correct cameras of fifteen captures seem to move by 0.15 %, because of shadows.
 MOST_SHIFT = 0.005
 
 # Something moves in the images of a camera if at least this share of the pixels differs by more than this many levels:
@@ -39,7 +40,7 @@ _FOLLOWS = 0.87
 Sampled = tuple[NDArray[np.int16], NDArray[np.bool_], NDArray[np.bool_]]
 """Images (C, h, w, 3) and masks (C, h, w) of a frame, every some pixels, and which of these each camera has."""
 
-MOVED = "moved"  #: the fault of a camera that has been moved since the first frame
+MOVED = "moved"  #: the fault of a camera that has been moved or zoomed since the first frame
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,7 @@ class ImageHealth(Stateful[HealthState]):
 #: (C,) the cameras that have it
 IMAGE_FAULTS: Mapping[str, tuple[str, Callable[[ImageHealth, _Look], NDArray[np.bool_]]]] = {
     "blank": ("shows nothing", ImageHealth._blank),
-    MOVED: ("has been moved since the first frame", ImageHealth._has_moved),
+    MOVED: ("has been moved or zoomed since the first frame", ImageHealth._has_moved),
     "frozen": ("stands still", ImageHealth._frozen),
 }
 

@@ -1,11 +1,12 @@
-"""How far the still parts of each camera's image have moved since the first frame: a camera that was bumped or sags.
+"""How far the still parts of each camera's image have moved since the first frame: a camera that was bumped, sags or is
+zoomed.
 
-The shift of an image is the translation that registers it with the first one, beside the person (Lucas & Kanade, "An
-Iterative Image Registration Technique with an Application to Stereo Vision", IJCAI 1981), together with the ratio of
-their contrasts, because the light may change. Shadows and other things that move are outliers of the registration and
-have small weights (Tukey's biweight). A turn of a camera by a small angle shifts its whole image; a roll or a step to
-the side do so in part. Along the planks of a floor, noise alone can shift an image by a pixel. A shift therefore counts
-only if the images differ clearly more without it.
+The shift of an image is the translation, with a zoom about the middle, that registers it with the first one, beside the
+person (Lucas & Kanade, "An Iterative Image Registration Technique with an Application to Stereo Vision", IJCAI 1981),
+together with the ratio of their contrasts, because the light may change. Shadows and other things that move are
+outliers of the registration and have small weights (Tukey's biweight). A turn of a camera by a small angle shifts its
+whole image; a roll or a step to the side do so in part. Along the planks of a floor, noise alone can shift an image by
+a pixel. A shift therefore counts only if the images differ clearly more without it.
 """
 
 from __future__ import annotations
@@ -41,6 +42,8 @@ _FREE, _LEAST_STILL = 0.5, 0.2
 _LEAST_CORRELATION = 0.75
 # Least ratio of the images' difference without the shift to that with it.
 _LEAST_RATIO = 1.25
+# Zooms from which a registration begins after a jump: the nearest one is off by at most 1.4 pixels, at the border.
+_ZOOMS = 1.06 ** np.arange(-4.0, 5.0)
 # Largest shift, share of the longer side, of an image that shows another camera's empty scene.
 _SAME_PLACE = 0.1
 
@@ -54,7 +57,7 @@ class ShiftState:
             frame.
         still: (C, n, n) where nobody is in them.
         begun: (C,) whether a camera's mask could be trusted in a frame.
-        shift: (C, 2) pixels.
+        shift: (C, 3) root mean square, over the image, of the pixels' displacement along x, along y, and by the zoom.
         calls: number of frames.
     """
 
@@ -79,7 +82,7 @@ class ImageShift(Stateful[ShiftState]):
         self._first: NDArray[np.uint8] | None = None
         self._still = np.zeros((0, 0, 0), np.bool_)
         self._begun = np.zeros(0, np.bool_)
-        self._shift = np.zeros((0, 2))
+        self._shift = np.zeros((0, 3))
         self._calls = 0
 
     def look(
@@ -97,7 +100,7 @@ class ImageShift(Stateful[ShiftState]):
         if self._first is None:
             self._first = np.zeros((C, _SIZE, _SIZE), np.uint8)
             self._still = np.zeros(self._first.shape, np.bool_)
-            self._begun, self._shift, self._calls = np.zeros(C, np.bool_), np.zeros((C, 2)), 0
+            self._begun, self._shift, self._calls = np.zeros(C, np.bool_), np.zeros((C, 3)), 0
         for c in np.flatnonzero(~self._begun).tolist():
             image, beside = self._small(c, images, masks)
             box = slice(image.shape[0]), slice(image.shape[1])
@@ -106,7 +109,7 @@ class ImageShift(Stateful[ShiftState]):
         if self._calls % _PAUSE:
             self._look_at(self._calls // _PAUSE % C, images, masks)
         self._calls += 1
-        return np.asarray(np.hypot(*self._shift.T) / _SIZE)
+        return np.asarray(np.linalg.norm(self._shift, axis=1) / _SIZE)
 
     def _small(self, c: int, images: NDArray[np.uint8], masks: NDArray[np.uint8]) -> tuple[Masks, NDArray[np.bool_]]:
         """Return a camera's image (h, w) at low resolution, and where nobody is in it."""
@@ -181,15 +184,29 @@ def _beside(mask: Masks) -> NDArray[np.bool_]:
 
 
 def _jump(first: Gray, now: Gray) -> Float:
-    """Return the shift (2,), whole pixels, with the largest cross-correlation of two images (h, w)."""
-    correlation = np.fft.irfft2(np.conj(np.fft.rfft2(first)) * np.fft.rfft2(now), first.shape)
-    at = np.array(np.unravel_index(correlation.argmax(), first.shape), np.float64)
-    size = np.array(first.shape)
-    return np.asarray(np.where(at > size / 2, at - size, at)[::-1])
+    """Return the shift (3,), whole pixels with one of :data:`_ZOOMS`, with the largest cross-correlation of two images
+    (h, w)."""
+    h, w = first.shape
+    spectrum, best, found = np.conj(np.fft.rfft2(first)), -np.inf, np.zeros(3)
+    for zoom in _ZOOMS:
+        from_now = np.array([[zoom, 0.0, (1 - zoom) * (w - 1) / 2], [0.0, zoom, (1 - zoom) * (h - 1) / 2]])
+        like_first = cv2.warpAffine(now, from_now, (w, h), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        correlation = np.fft.irfft2(spectrum * np.fft.rfft2(like_first), first.shape)
+        top = correlation.max() / (np.linalg.norm(like_first) + 1e-3)
+        if top > best:
+            y, x = np.unravel_index(correlation.argmax(), first.shape)
+            shift = x - w * (x > w / 2), y - h * (y > h / 2)
+            best, found = top, np.array([zoom * shift[0], zoom * shift[1], (zoom - 1) * _radius(h, w)])
+    return found
+
+
+def _radius(h: int, w: int) -> float:
+    """Return the root mean square distance of the pixels of an image (h, w) from its middle."""
+    return float(np.sqrt((h * h + w * w) / 12))
 
 
 def _register(first: Gray, now: Gray, still: NDArray[np.bool_], shift: Float) -> tuple[Float, float]:
-    """Return the shift (2,), pixels, that registers an image with the first one, and the correlation of both.
+    """Return the shift (3,) that registers an image with the first one, and the correlation of both.
 
     The shift is 0 if the images without it differ by hardly more.
 
@@ -197,24 +214,29 @@ def _register(first: Gray, now: Gray, still: NDArray[np.bool_], shift: Float) ->
         first: (h, w).
         now: (h, w).
         still: (h, w), pixels of the first image that count.
-        shift: (2,) where to begin.
+        shift: (3,) where to begin, see :class:`ShiftState`.
     """
     h, w = first.shape
     within = np.zeros(still.shape, np.bool_)
     border = int(_COARSE)
     within[border : h - border, border : w - border] = still[border : h - border, border : w - border]
     y, x = np.nonzero(within)
-    gradient = np.stack([cv2.Sobel(first, cv2.CV_32F, dx, 1 - dx, scale=1 / 8)[y, x] for dx in (1, 0)], axis=-1)
+    slope = np.stack([cv2.Sobel(first, cv2.CV_32F, dx, 1 - dx, scale=1 / 8)[y, x] for dx in (1, 0)], axis=-1)
+    outwards = np.column_stack([x - (w - 1) / 2, y - (h - 1) / 2]) / _radius(h, w)
+    gradient = np.column_stack([slope, (slope * outwards).sum(axis=1)])
     before = first[y, x]
 
+    def places(shift: Float) -> Float:
+        return np.asarray(np.stack([x, y]) + shift[:2, None] + shift[2] * outwards.T)
+
     def seen_by_both(shift: Float) -> NDArray[np.bool_]:
-        at_x, at_y = x + shift[0], y + shift[1]
+        at_x, at_y = places(shift)
         inside = (at_x >= border) & (at_x <= w - 1 - border) & (at_y >= border) & (at_y <= h - 1 - border)
         return np.asarray(inside)
 
     def values(seen: NDArray[np.bool_], shift: Float) -> tuple[Gray, Gray]:
         """Return the pixels' values in the first image and in this one."""
-        at_x, at_y = (x[seen] + shift[0]).astype(np.float32), (y[seen] + shift[1]).astype(np.float32)
+        at_x, at_y = places(shift)[:, seen].astype(np.float32)
         return before[seen], np.asarray(cv2.remap(now, at_x, at_y, cv2.INTER_LINEAR), np.float32).ravel()
 
     correlation, gain = 0.0, np.nan
@@ -236,9 +258,9 @@ def _register(first: Gray, now: Gray, still: NDArray[np.bool_], shift: Float) ->
         shift, gain = shift - step, gain + change
         if np.abs(step).max() < _CONVERGED:
             break
-    reference, moved = values(seen, np.zeros(2))
+    reference, moved = values(seen, np.zeros(3))
     if _deviation(moved - gain * reference) < _LEAST_RATIO * noise:
-        shift = np.zeros(2)
+        shift = np.zeros(3)
     return shift, correlation
 
 
