@@ -375,14 +375,24 @@ class ContourFinder:
             levels,
         )
 
-    def terms(self, pyramid: Pyramid, prior: Quadratic | None = None) -> Callable[[Float], Quadratic] | None:
-        """Return the terms of the cost beside the contours, about poses (B, D); None if there are none."""
+    def terms(
+        self, pyramid: Pyramid, prior: Quadratic | None = None, displaced: bool = False
+    ) -> Callable[[Float], Quadratic] | None:
+        """Return the terms of the cost beside the contours, about poses (B, D); None if there are none.
+
+        ``displaced``: the contours' equations have the displacements of segments as unknowns, so they count no edgel
+        too much, and cues need no weight.
+        """
         cues = self.cues(pyramid)
         if not cues and prior is None:
             return None
 
         def all_of(poses: Float) -> Quadratic:
-            terms = [cue.normal(poses).scaled(cue.weight / CONTOUR_INFORMATION) for cue in cues]
+            weights = [1.0 if displaced else cue.weight for cue in cues]
+            terms = [
+                cue.normal(poses).scaled(weight / CONTOUR_INFORMATION)
+                for cue, weight in zip(cues, weights, strict=True)
+            ]
             return reduce(add, terms if prior is None else [*terms, prior])
 
         return all_of

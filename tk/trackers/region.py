@@ -446,10 +446,11 @@ class RegionTracker(ContourTracker[RegionState]):
         """
         skeleton, search = self.body.skeleton, self.line_search
         if view_m:
-            search = replace(search, displacement=1.0 / (view_m**2 * CONTOUR_INFORMATION))
+            # along itself a contour says nothing; a step is held back there all the same
+            search = replace(search, displacement=1.0 / (view_m**2 * CONTOUR_INFORMATION), tangential=0.0)
         regions = None if images is None else self.colors.regions(images, self.views.rig.frame_shape)
         here = normal_equations(self.body.arrays, self.views.at(pyramid, 0), poses, search, regions)
-        terms = self.terms(pyramid, prior)
+        terms = self.terms(pyramid, prior, displaced=view_m > 0)
         assert terms is not None
         linear, matrix = terms(poses)
         diagonal = np.einsum("bdd->bd", here.hessian)

@@ -5,7 +5,8 @@ segment's contours in a view as a whole. Both are in the normal equations, where
 (:func:`tk.kernels.wrench.add_displaced`), so the pose's covariance contains them. Third, no joint of a person is a
 hinge at a point: the model's joint differs from the anatomical one by about a centimetre. As long as a limb keeps its
 direction relative to the trunk, this difference is a constant offset, which `tk evaluate` removes; when the limb turns,
-the offset turns with it. In the same way a spine bends along its length, but the model's bends at one point.
+the offset turns with it. In the same way a spine bends along its length, but the model's bends at one point; knees and
+ankles are held by their own contours.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from tk.model.body.skeleton import JOINTS, SEGMENTS, Skeleton
 
 Float = NDArray[np.float64]
 
-# Offset of a joint from the anatomical one, metres along an axis, and the error of all joints when the waist bends by
-# one radian, metres; fitted to rendered people, so that as many errors lie within 1 and 2 σ as for a normal
+# Offset of a joint from the anatomical one, metres along an axis, and the error of the trunk and of what it carries when
+# the waist bends by one radian, metres; fitted to rendered people, so that as many errors lie within 1 and 2 σ as for a normal
 # distribution.
-OFFSET_M, BENT_M = 0.0067, 0.0145
+OFFSET_M, BENT_M = 0.005, 0.02
 
 # Standard deviation of the displacement of a segment's contours in one view by clothes and the model's shape, metres
 # along an axis: of the part that is the same in all frames of a recording, and of the part that changes, chosen on
@@ -35,6 +36,8 @@ _TURNED = np.array([JOINTS.index(name) for name in _BONES])
 _FROM = np.array([JOINTS.index(start) for start, _ in _BONES.values()])
 _TO = np.array([JOINTS.index(end) for _, end in _BONES.values()])
 _TRUNK = SEGMENTS.index("torso")
+# the joints that move with a spine that bends
+_WITH_SPINE = np.array([all(name not in LIMBS[leg][1:] for leg in ("leg_l", "leg_r")) for name in JOINTS])
 
 
 def pose_variance(skeleton: Skeleton, pose: Float, covariance: Float) -> Float:
@@ -69,4 +72,4 @@ def posture_variance(skeleton: Skeleton, poses: Float, mean: Float) -> Float:
     length = np.linalg.norm(mean, axis=-1, keepdims=True)
     turned = directions(skeleton, poses) - mean / np.where(length > 0, length, 1.0)
     bent = (np.asarray(poses)[..., skeleton.is_waist] ** 2).sum(axis=-1, keepdims=True)
-    return np.asarray(OFFSET_M**2 * (turned**2).sum(axis=-1) + BENT_M**2 * bent)
+    return np.asarray(OFFSET_M**2 * (turned**2).sum(axis=-1) + BENT_M**2 * bent * _WITH_SPINE)

@@ -40,8 +40,9 @@ class Cue(Protocol):
     """What was measured of one person in a frame, or in B frames, about poses (B, D) of a body.
 
     Attributes:
-        weight: factor of :meth:`normal` where it is added to the contours' equations of a frame. These count edgels of
-            a segment as independent, but clothes and wrong pieces of a mask displace all of them together.
+        weight: factor of :meth:`normal` where it is added to the contours' equations of a frame for a step. These count
+            edgels of a segment as independent, but clothes and wrong pieces of a mask displace all of them together.
+            Where sigma is computed, this displacement is an unknown, and the factor is 1.
     """
 
     weight: float
