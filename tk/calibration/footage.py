@@ -140,8 +140,8 @@ def read_footage(
             found.append(Footage(name, path, clip=clip))
     longest = max((footage.clip.frame_count for footage in found if footage.clip), default=0)
     step = max(1, -(-longest // _LOOKS))  # of all cameras, so that their instants are the same
-    for footage in found:
-        progress(f"searching for the board in {footage.path}")
+    for number, footage in enumerate(found, start=1):
+        progress(f"searching for the board in the images of {footage.name}, camera {number} of {len(found)}")
         for instant, grey, following in _images(footage, step):
             _look(footage, board, instant, grey, following)
     return found

@@ -31,7 +31,7 @@ def inspect(
 ) -> None:
     """Check CAPTURE before tracking: masks, inconsistent or unsynchronised cameras, working volume, floor, up."""
     sheet, plan = (None, None) if output is None else (output / "inspect.png", output / "people.png")
-    with base.working(f"inspecting {capture}"):
+    with base.working(f"inspecting {capture}") as reporter:
         from tk.inspection.checks import inspect as check
         from tk.inspection.floor_plan import floor_plan
         from tk.inspection.pictures import write_sheet
@@ -46,7 +46,7 @@ def inspect(
         settings = base.load_settings(config_file, resample=resample)
         opened = open_recording(capture, cameras, masks, settings.resample)
         opened = reduce_images(opened, settings.person_pixels)
-        found, shown = check(opened, settings)
+        found, shown = check(opened, settings, within=reporter.within)
         if sheet is not None and plan is not None:
             write_sheet(sheet, opened, found, shown)
             write_png(plan, floor_plan(opened, found.people), CaptureError)
