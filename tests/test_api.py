@@ -88,6 +88,13 @@ def test_path_is_tracked_once_and_the_result_is_described_in_three_lines(tiny: P
     assert "causal.h5" in lines[0] and f"{FRAMES} frames" in lines[1]
 
 
+def test_progress_is_logged(tiny: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO", "tk"):
+        tk.track(tiny, tmp_path / "r.h5", config=settings_file.from_toml(QUICK), causal=True)
+    shown = [record.getMessage() for record in caplog.records if re.match(r"frame \d+: ", record.getMessage())]
+    assert 1 < len(shown) <= 10 and shown[-1].endswith(f": {FRAMES}/{FRAMES}"), shown
+
+
 def test_notes_are_logged(copy, tmp_path, caplog):
     write_video(copy / "videos" / "cam2.mp4", [picture(1, k, (160, 120)) for k in range(3)])
     config = settings_file.from_toml(QUICK)

@@ -36,10 +36,21 @@ PathLike = str | os.PathLike[str]
 
 
 class _Logged(Silent):
-    """The reporter of scripts: notes become warnings of the logger "tk", progress is ignored."""
+    """The reporter of scripts: notes become warnings of the logger "tk", each tenth of the frames an INFO record."""
+
+    def __init__(self) -> None:
+        self._total = self._done = 0
 
     def note(self, text: str) -> None:
         _LOG.warning("%s", text)
+
+    def begin(self, total: int, done: int) -> None:
+        self._total, self._done = total, done
+
+    def advance(self, frame: int, estimate: object) -> None:
+        self._done += 1
+        if self._total and 10 * self._done // self._total > 10 * (self._done - 1) // self._total:
+            _LOG.info("frame %d: %d/%d", frame, self._done, self._total)
 
 
 def open_capture(

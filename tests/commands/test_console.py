@@ -9,6 +9,7 @@ import re
 import time
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -109,10 +110,12 @@ def test_long_stage_shows_that_it_goes_on(capfd: pytest.CaptureFixture[str], mon
     with ConsoleReporter() as reporter, ConsoleReporter(quiet=True) as quiet:
         for each in (reporter, quiet):
             each.stage("compiling")
-        time.sleep(1.2)
+        time.sleep(2.0)
     lines = capfd.readouterr().err.splitlines()
-    assert len(lines) >= 2 and lines[0].endswith("] compiling")
+    assert len(lines) >= 3 and lines[0].endswith("] compiling")
     assert all(line.endswith("] still compiling") for line in lines[1:])
+    at = [float(line[1:].split()[0]) for line in lines]
+    assert np.all(np.diff(at) >= [2.0 * 2**k for k in range(len(lines) - 1)]), "each silence is twice as long"
 
 
 def test_folder_that_must_not_be_read_ends_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,6 +15,7 @@ from tests.export.conftest import FIRST, FPS, FRAMES, LOST, SKELETON, Write, pos
 from tests.export.test_opensim import read_trc
 from tk.errors import ConfigError, ExportError, ResultError
 from tk.export import FORMATS, Motion, export, read_motion
+from tk.io.results.reader import read_result
 from tk.io.results.status import Status
 from tk.model.body.angles import standing_rotations
 from tk.model.body.anthropometry import BodyDimensions
@@ -32,20 +33,19 @@ def test_csv_of_points(write: Write) -> None:
     sigma = np.full(15, 0.02)
     points, _ = export(write(meta={"sigma": True}, rows=lambda f: {"joints/sigma": sigma}), ["csv"]).files
     rows = rows_of(points)
-    assert list(rows[0]) == ["frame", "time", "status", "point", "x", "y", "z", "sigma"]
-    assert len(rows) == FRAMES * (len(JOINTS) + 4)
-    for row in rows:
-        f = int(row["frame"]) - FIRST
-        assert float(row["time"]) == pytest.approx(int(row["frame"]) / FPS, abs=1e-6)
+    joints = [f"{name}_{part}" for name in JOINTS for part in ("x", "y", "z", "sigma")]
+    feet = [f"{name}_{axis}" for name in FOOT_POINTS for axis in "xyz"]
+    assert list(rows[0]) == ["frame", "time", "status", *joints, *feet]
+    assert [int(row["frame"]) for row in rows] == list(range(FIRST, FIRST + FRAMES))
+    for f, row in enumerate(rows):
+        assert float(row["time"]) == pytest.approx((FIRST + f) / FPS, abs=1e-6)
         assert row["status"] == {0: "initialised"}.get(f, "lost" if f in LOST else "tracked")
         if f in LOST:
-            assert row["x"] == row["sigma"] == ""
-        elif row["point"] in JOINTS:
-            place = SKELETON.joints(poses()[f])[JOINTS.index(row["point"])]
-            np.testing.assert_allclose([float(row[axis]) for axis in "xyz"], place, atol=1e-6)
-            assert float(row["sigma"]) == 0.02
-        else:
-            assert row["point"] in FOOT_POINTS and row["sigma"] == ""
+            assert {row[name] for name in joints + feet} == {""}
+            continue
+        for name, place in zip(JOINTS, SKELETON.joints(poses()[f]), strict=True):
+            np.testing.assert_allclose([float(row[f"{name}_{axis}"]) for axis in "xyz"], place, atol=1e-6)
+            assert float(row[f"{name}_sigma"]) == 0.02
 
 
 def test_csv_of_angles(write: Write) -> None:
@@ -54,11 +54,18 @@ def test_csv_of_angles(write: Write) -> None:
     assert written.notes[-1] == f"{angles}: blank: neck rotation: only landmarks show it, and none were used"
     assert angles.name == "walk_angles.csv"
     rows = rows_of(angles)
-    assert {row["degrees"] for row in rows if (row["joint"], row["angle"]) == ("neck", "rotation")} == {""}
-    knee = [row for row in rows if row["joint"] == "knee_l"]
-    assert len(knee) == FRAMES and knee[LOST[0]]["degrees"] == ""
+    assert len(rows) == FRAMES and {row["neck_rotation_deg"] for row in rows} == {""}
+    assert {value for name, value in rows[LOST[0]].items() if name.endswith("_deg")} == {""}
     expected = np.degrees(poses()[3, SKELETON.index("knee_l_flexion")])
-    assert float(knee[3]["degrees"]) == pytest.approx(expected, abs=1e-4)
+    assert float(rows[3]["knee_l_flexion_deg"]) == pytest.approx(expected, abs=1e-4)
+
+
+def test_csv_has_the_names_of_the_pandas_table(write: Write) -> None:
+    pytest.importorskip("pandas")
+    path = write(meta={"sigma": True})
+    table = {"frame", *read_result(path).to_pandas().columns}
+    points, _ = export(path, ["csv"]).files
+    assert set(rows_of(points)[0]) - {f"{foot}_{axis}" for foot in FOOT_POINTS for axis in "xyz"} <= table
 
 
 def test_without_a_waist(write: Write) -> None:

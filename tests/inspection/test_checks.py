@@ -51,6 +51,15 @@ def test_good_capture_has_no_findings_and_gets_a_sheet(tk: Tk, tiny: Path, tmp_p
     tk("inspect", tiny, "-o", tmp_path / "sheets").complaint("inspect.png", "exists", "--force")
 
 
+def test_stages_and_shares_are_reported(tiny: Path, caplog: pytest.LogCaptureFixture) -> None:
+    shares: list[float] = []
+    with caplog.at_level("INFO", "tk"):
+        inspect(open_capture(tiny), Settings(), within=shares.append)
+    stages = [record.getMessage() for record in caplog.records if record.name == "tk.inspection.checks"]
+    assert stages[0] == "making masks of the first frame" and stages[-1].startswith("comparing the masks of ")
+    assert shares == sorted(shares) and shares[0] > 0 and shares[-1] == 1
+
+
 def test_turned_camera_is_named(tk: Tk, copy: Path) -> None:
     turn_camera(copy, 1, 6.0)
     ran = tk("inspect", copy, "--json")

@@ -106,7 +106,6 @@ def test_a_killed_process_does_not_switch_the_cache_off_for_good(tmp_path, age_s
     """
     words = run(code, TI_OFFLINE_CACHE_FILE_PATH=str(tmp_path))
     assert lock.exists() == stays
-    assert words[:3] == ["starting", "the", "kernels" if is_compiled else "kernels;"]
     assert ("compiling" in words) != is_compiled
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 import shutil
 from collections.abc import Callable
 from fractions import Fraction
@@ -307,3 +309,13 @@ def test_fault_is_one_line_that_names_the_camera(copy: Path, fault: str) -> None
     assert result.exit_code == 2, result.output
     assert line in result.stderr and result.stderr.strip().count("\n") == 0, result.stderr
     assert not (capture / "capture.toml").exists()
+
+
+def test_suggested_offsets_are_accepted_once_seconds_are_filled_in(copy: Path) -> None:
+    """Also where names have spaces, as a shell reads the line; offsets that are known are kept."""
+    no_sound_no_motion(copy)
+    (copy / "c.mp4").rename(copy / "the third.mp4")
+    given = shlex.split(run(copy)[0].stderr.split("give --offsets ")[1])[0]
+    assert re.fullmatch(r"a=0,b=SECONDS,the third=-?\d+\.\d{4}", given), given
+    result, capture = run(copy, "--offsets", given.replace("SECONDS", "2.2"))
+    assert result.exit_code == 0 and (capture / "capture.toml").exists(), result.stderr

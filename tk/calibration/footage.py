@@ -144,8 +144,8 @@ def read_footage(
     longest = max((footage.clip.frame_count for footage in found if footage.clip), default=0)
     step = max(1, -(-longest // _LOOKS))  # of all cameras, so that their instants are the same
     patterns = board.patterns
-    for footage in found:
-        progress(f"searching for the board in {footage.path}")
+    for number, footage in enumerate(found, start=1):
+        progress(f"searching for the board in the images of {footage.name}, camera {number} of {len(found)}")
         for instant, grey, following in _images(footage, step):
             detections = [(pattern, detect(grey, pattern)) for pattern in patterns]
             shown, seen = max(detections, key=lambda one: 0 if one[1] is None else len(one[1].ids))

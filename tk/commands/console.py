@@ -36,6 +36,8 @@ _LOG = logging.getLogger("tk")
 #: longest silence and seconds between two lines of progress if stderr is no terminal. It only decides how many lines a
 #: log file gets.
 _PERIOD_S = 2.0
+#: longest silence in a long stage without a terminal, seconds
+_SILENCE_S = 60.0
 #: captures named in a batch's line of progress; more would not fit on a line
 _NAMED_CAPTURES = 4
 
@@ -85,7 +87,7 @@ class _TimeLeft(ProgressColumn):
 class ConsoleReporter(_Notes):
     """The reporter of a command, see :class:`tk.run.reporter.Reporter`; a context manager.
 
-    Without a terminal a line every two seconds shows that a long stage goes on.
+    Without a terminal lines show that a long stage goes on, after two seconds and then ever less often.
 
     Args:
         quiet: print notes only, no progress.
@@ -136,10 +138,14 @@ class ConsoleReporter(_Notes):
         (self.note if record.levelno >= logging.WARNING else self.stage)(record.getMessage())
 
     def _show_life(self) -> None:
-        """Print a line whenever nothing was printed for two seconds."""
+        """Print a line after a silence of two seconds, four, eight and so on up to a minute, anew in each stage."""
+        stage, silence_s = "", _PERIOD_S
         while not self._closed.wait(_PERIOD_S / 4):
-            if self._stage and time.perf_counter() - self._last > _PERIOD_S:
-                self._print(", ".join([f"still {self._stage}", *self._left()]))
+            if self._stage != stage:
+                stage, silence_s = self._stage, _PERIOD_S
+            if stage and time.perf_counter() - self._last > silence_s:
+                self._print(", ".join([f"still {stage}", *self._left()]))
+                silence_s = min(2 * silence_s, _SILENCE_S)
 
     def _print(self, text: str) -> None:
         """Print a line with the time since the begin."""

@@ -33,7 +33,7 @@ def inspect(
 ) -> None:
     """Check CAPTURE before tracking: masks, inconsistent or unsynchronised cameras, working volume, floor, up."""
     pictures = [] if output is None else [output / "inspect.png", output / "people.png"]
-    with base.working(f"inspecting {capture}"):
+    with base.working(f"inspecting {capture}") as reporter:
         from tk.inspection.checks import inspect as check
         from tk.inspection.floor_plan import floor_plan
         from tk.inspection.pictures import write_sheet
@@ -47,7 +47,7 @@ def inspect(
         settings = base.load_settings(config_file, resample=resample)
         opened = open_recording(capture, cameras, masks, settings.resample)
         opened = reduce_images(opened, settings.person_pixels)
-        found, shown = check(opened, settings)
+        found, shown = check(opened, settings, within=reporter.within)
         if output is not None:
             sheet, plan = pictures
             write_sheet(sheet, opened, found, shown)

@@ -9,7 +9,8 @@ of these pixels.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import logging
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -42,6 +43,7 @@ from tk.trackers.camera_monitor import confirmed
 from tk.trackers.judgement import FAULTS
 
 Masks = NDArray[np.uint8]
+_LOG = logging.getLogger(__name__)
 
 #: frames that are compared; frames whose neighbours, REACH before and after, are also compared. These values decide
 #: which findings are printed, and no tracking result depends on them.
@@ -56,13 +58,16 @@ _AT_BORDER = 0.03
 
 
 @one_thread()
-def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Inspection, list[Sample]]:
+def inspect(
+    capture: Capture, config: Settings, pictures: int = 3, within: Callable[[float], None] = lambda share: None
+) -> tuple[Inspection, list[Sample]]:
     """Check a capture.
 
     Args:
         capture: the capture.
         config: settings of the segmentation.
         pictures: number of frames to return for the sheet.
+        within: receives the share of the frames that are read.
 
     Raises:
         CaptureError: the capture cannot be read.
@@ -75,7 +80,8 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
     centers = np.unique(np.linspace(quarter, last, _DELAY_FRAMES).round().astype(int)).tolist()
     near = {i + s for i in centers for s in range(-REACH, REACH + 1)} & set(span)
     kept = frames[np.linspace(0, len(frames) - 1, min(pictures, len(frames))).round().astype(int)]
-    read = _read(capture, config, span, near | set(frames.tolist()), set(kept.tolist()))
+    read = _read(capture, config, span, near | set(frames.tolist()), set(kept.tolist()), within)
+    _LOG.info("comparing the masks of %d cameras", len(capture.rig))
     notes, small, masks = read.notes, read.small, read.masks
     pairs = [(i + s, i + s + REACH) for i in centers for s in (-REACH, 0)]
     given = [(small[i], small[k]) for i, k in pairs if capture.has_masks and i in small and k in small]
@@ -158,20 +164,26 @@ class _Read:
     notes: list[str]
 
 
-def _read(capture: Capture, config: Settings, span: range, compared: set[int], kept: set[int]) -> _Read:
+def _read(
+    capture: Capture, config: Settings, span: range, compared: set[int], kept: set[int], within: Callable[[float], None]
+) -> _Read:
     """Decode and segment the frames of ``span``; return the masks of the frames that are ``compared``, and the
     images of those that are ``kept``."""
     notes = list(capture.warnings)
+    _LOG.info("making masks of the first frame")
     label = make_labeller(Task.of(capture, config), notes.append)
     read = _Read({}, {}, {}, {}, tuple({} for _ in capture.rig), PeopleWatch(capture, span), notes)
     health = ImageHealth(capture.rig.sizes)
+    watched = {i for i in span if read.watch.wants(i)}
+    due = watched | compared
     with capture.frames(span.start, span.stop) as reader:
-        for frame in reader:
-            i, watched = frame.index, read.watch.wants(frame.index)
-            if not watched and i not in compared:
-                continue
-            labels = label(frame)
-            if watched:
+        for done, frame in enumerate(frame for frame in reader if frame.index in due):
+            i, labels = frame.index, label(frame)
+            if done:
+                within(done / (len(due) - 1))
+            else:  # it takes longer than the others: a network is loaded
+                _LOG.info("making masks of %d further frames", len(due) - 1)
+            if i in watched:
                 read.watch.look(i, labels)
             if i in compared:
                 read.masks[i], read.landmarks[i] = labels.masks.copy(), labels.landmarks

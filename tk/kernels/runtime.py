@@ -101,8 +101,8 @@ def ensure_runtime() -> None:
     _break_stale_lock()
     with contextlib.suppress(ImportError, AttributeError):  # another Taichi
         shorten_notes(importlib.import_module("taichi.lang.ast.ast_transformer_utils"), ti.lang.kernel_impl)
-    first = not any(_cache_folder().glob("*.tic"))
-    _LOG.info(f"starting the kernels{'; compiling them for the first time takes some seconds' * first}")
+    if not any(_cache_folder().glob("*.tic")):
+        _LOG.info("compiling the kernels for the first time takes some seconds")
     with contextlib.redirect_stdout(io.StringIO()):  # it prints a line at start at any log level
         ti.init(**options)
     # else the program and its threads are destroyed at the interpreter's end, in any order

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -108,8 +109,17 @@ def refused(recordings: Sequence[Recording], decision: Decision) -> ClockError:
     return ClockError(
         f"{recordings[first].where}: not sure when it was recorded: {decision.unsure[first]}"
         + (f"; neither are {', '.join(others)}" if others else "")
-        + f"; give --offsets {recordings[0].name}=0,{recordings[first if first else 1].name}=SECONDS by hand{hint}"
+        + f"; give --offsets {shlex.quote(_offsets(recordings, decision))} by hand{hint}"
     )
+
+
+def _offsets(recordings: Sequence[Recording], decision: Decision) -> str:
+    """Return the value of ``--offsets`` with what is known, and SECONDS in the other places."""
+    known = np.isfinite(decision.clocks.offsets_s) & (0 not in decision.unsure)
+    known[list(decision.unsure)] = False
+    seconds = [f"{s:.4f}" if k else "SECONDS" for s, k in zip(decision.clocks.offsets_s, known, strict=True)]
+    names = [recording.name for recording in recordings]
+    return ",".join([f"{names[0]}=0", *(f"{name}={s}" for name, s in zip(names[1:], seconds[1:], strict=True))])
 
 
 def timecode_ties(recordings: Sequence[Recording]) -> list[Tie]:

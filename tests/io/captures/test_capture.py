@@ -211,6 +211,10 @@ def test_a_camera_without_video_is_reported(make_capture: MakeCapture) -> None:
     (folder / "videos").rename(folder / "movies")
     with pytest.raises(VideoError, match="neither videos/ nor images/"):
         open_capture(folder)
+    (folder / "movies" / "cam1.mp4").rename(folder / "cam1.mp4")
+    with refused(VideoError, "has no videos/; cam1.mp4 is in the folder itself", "move them to videos/") as caught:
+        open_capture(folder)
+    assert f"tk sync {folder} -o CAPTURE" in caught.value.hint
 
 
 def test_an_image_size_other_than_calibrated_is_refused(make_capture: MakeCapture) -> None:

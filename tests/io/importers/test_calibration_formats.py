@@ -295,13 +295,14 @@ def test_opencv_poses_of_the_cameras_are_recognised(folder: Path, check: Import)
     check(folder, rig, tolerance_px=EXACT_PX).note("rvec and tvec map camera to world")
 
 
-def test_opencv_json_with_all_cameras(folder: Path, check: Import) -> None:
+@pytest.mark.parametrize(("matrix", "distortions"), [("camera_matrix", "dist_coeffs"), ("K", "dist"), ("mtx", "D")])
+def test_opencv_json_with_all_cameras(folder: Path, check: Import, matrix: str, distortions: str) -> None:
     rig = make_rig()
     document = {
         camera.name: {
             "image_size": [WIDTH, HEIGHT],
-            "camera_matrix": camera.matrix.tolist(),
-            "dist_coeffs": camera.distortions.tolist(),
+            matrix: camera.matrix.tolist(),
+            distortions: camera.distortions.tolist(),
             "R": camera.rotation.tolist(),
             "t": camera.translation.tolist(),
         }

@@ -63,6 +63,13 @@ def test_pose2sim(folder: Path, check: Import) -> None:
     assert "\n# up: the axis" in text and "[volume]" in text
 
 
+def test_matches_by_parts_of_names_are_reported(folder: Path, check: Import) -> None:
+    rig = write_pose2sim(folder)
+    write_clips(folder / "videos", [f"walk - Camera {n}" for n in range(1, 5)])
+    note = check(folder, rig).note("matched by parts of them")
+    assert "int_cam01_img ↔ walk - Camera 1.mp4" in note and "int_cam04_img ↔ walk - Camera 4.mp4" in note
+
+
 def test_pose2sim_matches_in_order_if_names_differ(folder: Path, check: Import) -> None:
     rig = write_pose2sim(folder)
     write_clips(folder / "raw-2d", ["back", "front", "left", "right"])

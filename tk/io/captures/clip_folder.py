@@ -59,6 +59,12 @@ def open_clips(calibration: Calibration, path: Path) -> tuple[Clip, ...]:
     for folder in (path / "videos", path / "images"):
         if folder.is_dir():
             return clips_of(calibration, folder, "video" if folder.name == "videos" else "folder of pictures", "mp4")
+    if loose := [file.name for file in sorted(path.iterdir()) if file.suffix.lower() in VIDEO_SUFFIXES]:
+        raise VideoError(
+            f"{path}: has no videos/; {loose[0]} is in the folder itself: if all videos start at the same instant, "
+            "move them to videos/",
+            hint=f"otherwise type tk sync {path} -o CAPTURE",
+        )
     raise VideoError(f"{path}: has neither videos/ nor images/, and its capture.toml no [videos]")
 
 

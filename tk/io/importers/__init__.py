@@ -69,12 +69,13 @@ def read_project(folder: Path, wanted: Wanted = _ANYTHING) -> Project:
     found = _find(folder)
     if found is not None:
         return read_format(*found, folder, wanted)
-    searched = ", ".join(dict.fromkeys(form.patterns[0] for form in FORMATS))
+    known = [form for form in FORMATS if form is not opencv.FORMAT]
+    searched = ", ".join(dict.fromkeys(form.patterns[0] for form in [*known, opencv.FORMAT]))
     here = sorted(f"{path.name}/" if path.is_dir() else path.name for path in folder.iterdir())
     names = ", ".join(here[:_NAMED]) + (f" and {len(here) - _NAMED} more" if len(here) > _NAMED else "")
     raise CaptureError(
         f"{folder}: has no calibration of a tool that tk imports from: it holds {names or 'nothing'}; "
-        f"searched: {searched}"
+        f"searched: {searched} (with camera_matrix, rvec, tvec)"
     )
 
 

@@ -34,7 +34,10 @@ _SIZE = ("imagesize", "size", "resolution")
 _WIDTH, _HEIGHT = ("imagewidth", "width"), ("imageheight", "height")
 
 #: bytes of which one is in every file that is looked into
-_SIGNS = (b"camera_matrix", b"cameraMatrix", b"CameraMatrix", b"opencv-matrix", b"dist_coeffs", b"distCoeffs")
+_SIGNS = (
+    b"camera_matrix", b"cameraMatrix", b"CameraMatrix", b"opencv-matrix", b"dist_coeffs", b"distCoeffs", b"rvec",
+    b"tvec", b"mtx", b'"K"',
+)  # fmt: skip
 
 
 def _read(files: Sequence[Path]) -> Tables:

@@ -60,11 +60,10 @@ def find_clips(
     """
     folder, clips = _one_recording(root, patterns, trial, images)
     notes: list[str] = []
-    stems = match_clips(cameras, list(clips))
+    stems, how = match_clips(cameras, list(clips)), "names differ, so cameras and videos are matched by parts of them"
     if stems is None and in_order and len(clips) == len(cameras):
         stems = in_order_of_names(cameras, list(clips))
-        pairs = ", ".join(f"{camera.name} ↔ {clips[stem].name}" for camera, stem in zip(cameras, stems, strict=True))
-        notes.append(f"{folder}: names do not match, so cameras and videos are matched in their order: {pairs}")
+        how = "names do not match, so cameras and videos are matched in their order"
     if stems is None:
         names = ", ".join(camera.name for camera in cameras[:12]) + (", …" if len(cameras) > 12 else "")
         raise VideoError(
@@ -72,6 +71,9 @@ def find_clips(
             f"{_some(clips)}; rename the videos to the cameras' names",
             hint="" if trial else "or choose a recording with --trial NAME",
         )
+    pairs = [(camera, stem) for camera, stem in zip(cameras, stems, strict=True) if stem is not None]
+    if any(stem not in (camera.name, camera.key) for camera, stem in pairs):
+        notes.append(f"{folder}: {how}: " + ", ".join(f"{camera.name} ↔ {clips[stem].name}" for camera, stem in pairs))
     if left := sorted(set(clips) - set(stems)):
         notes.append(f"{folder}: no camera matches {_some(left)}")
     return Found(folder, tuple(clips.get(stem or "") for stem in stems), tuple(notes))
