@@ -19,7 +19,7 @@ from tk.model.body.skeleton import JOINTS, SEGMENTS, Skeleton
 
 Float = NDArray[np.float64]
 
-# Offset of a joint from the anatomical one, metres along an axis, and the error of the trunk and of what it carries when
+# Offset of a joint from the anatomical one, metres along an axis, and the error of the trunk and of what it carries if
 # the waist bends by one radian, metres; fitted to rendered people, so that as many errors lie within 1 and 2 σ as for a
 # normal distribution.
 OFFSET_M, BENT_M = 0.005, 0.02
