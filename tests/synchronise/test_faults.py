@@ -24,8 +24,7 @@ from tk.synchronise.faults import (
     still_parts,
     unchecked_chapters,
 )
-from tk.synchronise.looks import Look
-from tk.synchronise.person import GRID_HZ
+from tk.synchronise.looks import GRID_HZ, Look
 from tk.synchronise.raw import Recording
 from tk.synchronise.sound import RATE, Track, hear, read_track
 from tk.synchronise.ties import Clocks, Tie

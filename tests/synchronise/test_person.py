@@ -10,8 +10,8 @@ import pytest
 from tests.synchronise.scenes import ring, wander, watch
 from tk.synchronise.empty import find_empty
 from tk.synchronise.flash import compare_events
-from tk.synchronise.looks import Look
-from tk.synchronise.person import GRID_HZ, align, compare_planes, compare_signals, signals_of
+from tk.synchronise.looks import GRID_HZ, Look
+from tk.synchronise.person import align, compare_planes, compare_signals, signals_of
 from tk.synchronise.run import is_mirrored
 from tk.synchronise.ties import Clocks, solve
 

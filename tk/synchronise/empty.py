@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.synchronise.looks import DIFFERS, SOMEBODY, Look
-from tk.synchronise.person import GRID_HZ
+from tk.synchronise.looks import DIFFERS, GRID_HZ, SOMEBODY, Look
 from tk.synchronise.raw import SHORTEST_S
 from tk.synchronise.ties import Clocks
 
