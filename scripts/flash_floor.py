@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.synchronise.flash import Event, ties_of_changes
+from tk.synchronise.ties import solve
 
 Float = NDArray[np.float64]
 
@@ -72,8 +73,8 @@ def errors_ms(fps: int, lamp: Float, seed: int, kind: type[Event]) -> Float:
             own = float(near[(lit * (1 - lit)).argmax()] if len(lit) > 2 else near.mean())
             interval = float(np.median(np.diff(times)))
             events[-1].append(kind(own, interval, 45.0, near, lit, float(np.hypot(0.1, NOISE))))
-    ties = ties_of_changes([{c: events[c][k] for c in range(4)} for k in range(len(lamp))])
-    return np.array([1000 * (tie.own_i - tie.own_j - offsets[tie.j] + offsets[0]) for tie in ties])
+    clocks = solve(4, ties_of_changes([{c: events[c][k] for c in range(4)} for k in range(len(lamp))]))
+    return np.asarray(1000 * (clocks.offsets_s - offsets + offsets[0])[1:])
 
 
 def main() -> None:

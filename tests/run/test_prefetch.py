@@ -178,15 +178,15 @@ def test_a_killed_process_is_reported_in_one_line(tiny: Path, tmp_path: Path, mo
         def advance(self, frame: int, estimate: object) -> None:
             super().advance(frame, estimate)
             if frame == 1:
-                opened[0]._process.kill()
+                started[-1].kill()
 
-    opened, init = list[Ahead](), Ahead.__init__
+    started, start = list[Any](), subprocess.Popen
 
-    def watched(source: Ahead, *given: Any, **options: Any) -> None:
-        opened.append(source)
-        init(source, *given, **options)
+    def watched(*given: Any, **options: Any) -> Any:
+        started.append(start(*given, **options))
+        return started[-1]
 
-    monkeypatch.setattr(Ahead, "__init__", watched)
+    monkeypatch.setattr(subprocess, "Popen", watched)
     killer = Killer()
     with pytest.raises(WorkerError, match=r"tiny: the process .* was ended by SIGKILL \(out of memory\?\); ahead = 0"):
         track(open_capture(tiny), tmp_path / "r.h5", AHEAD, killer)

@@ -24,8 +24,7 @@ from tk.synchronise.faults import (
     still_parts,
     unchecked_chapters,
 )
-from tk.synchronise.looks import Look
-from tk.synchronise.person import GRID_HZ
+from tk.synchronise.looks import GRID_HZ, Look
 from tk.synchronise.raw import Recording
 from tk.synchronise.sound import RATE, Track, hear, read_track
 from tk.synchronise.ties import Clocks, Tie
@@ -57,6 +56,12 @@ def motion(length_s: float = 40.0) -> list[Float]:
     return list(common / common.std() + 0.7 * noise / noise.std())
 
 
+def slowed(signal: Float) -> Float:
+    """Return a signal as of 30 images/s that are labelled 25."""
+    at = np.arange(0, len(signal) - 1, 1 / 1.2)
+    return np.stack([np.interp(at, np.arange(len(signal)), column) for column in signal.T], axis=1)
+
+
 def motion_fault(
     signals: Sequence[Float], offsets: Sequence[float] = (0.0, 0.0, 0.0), ties: Sequence[Tie] = ()
 ) -> dict[int, str]:
@@ -73,17 +78,13 @@ def test_right_motion_has_no_fault() -> None:
 def test_wrong_rate_of_a_file_is_named(known: bool) -> None:
     """30 images/s that are labelled 25, also where no method gives an offset."""
     one, two, three = motion()
-    at = np.arange(0, len(two) - 1, 1 / 1.2)
-    slow = np.stack([np.interp(at, np.arange(len(two)), column) for column in two.T], axis=1)
-    (camera, text), = motion_fault([one, slow, three], (0, 0 if known else np.nan, 0)).items()  # fmt: skip
+    (camera, text), = motion_fault([one, slowed(two), three], (0, 0 if known else np.nan, 0)).items()  # fmt: skip
     assert camera == 1 and "its motion is 1.2 times slower than that of the others" in text
 
 
 def test_camera_that_is_synchronised_is_not_blamed_for_one_that_is_not() -> None:
     one, two, three = motion()
-    at = np.arange(0, len(two) - 1, 1 / 1.2)
-    slow = np.stack([np.interp(at, np.arange(len(two)), column) for column in two.T], axis=1)
-    assert motion_fault([one, slow, np.roll(three, 9 * GRID_HZ, axis=0)], (0.0, 0.0, np.nan)) == {}
+    assert motion_fault([one, slowed(two), np.roll(three, 9 * GRID_HZ, axis=0)], (0.0, 0.0, np.nan)) == {}
 
 
 def test_chapters_in_another_order_are_named() -> None:

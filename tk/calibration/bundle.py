@@ -22,8 +22,8 @@ Float = NDArray[np.float64]
 _HELD = 1e14
 #: Cauchy's scale in standard deviations: its 95 % efficiency on normal noise
 _CAUCHY = 2.385
-#: iterations, and relative decrease of the cost below which they end
-_MOST_ROUNDS, _ENOUGH = 60, 1e-7
+#: relative decrease of the cost below which the iterations end
+_ENOUGH = 1e-7
 #: time between the images of one instant, frames: synchronised videos are within half a frame of each other
 UNSYNCHRONISED = 0.29  # standard deviation of a uniform distribution of that width
 #: least share of a part's information about its focal length that the other unknowns do not explain
@@ -91,14 +91,12 @@ class Solved:
         noise_px: standard deviation of a point's pixel along one axis.
         reduced: normal equations of the shared unknowns at the estimate, in units of the noise.
         slices: of each camera in the shared unknowns: 6 of the pose (rotation, translation), then its intrinsics.
-        converged: whether the cost stopped decreasing.
     """
 
     state: State
     noise_px: float
     reduced: Reduced
     slices: tuple[slice, ...]
-    converged: bool
 
     def covariance(self) -> Float:
         """Return (S, S) covariance of the shared unknowns, the larger of two along each eigenvector.
@@ -155,20 +153,20 @@ def adjust(start: State, views: Sequence[View], noise_px: float = 1.0) -> Solved
         slices.append(slice(at, at + 6 + lens.model.size))
         at += 6 + lens.model.size
     problem = _Problem(views, tuple(slices), sorted(start.boards))
-    state, converged = start, False
+    state = start
     for k in range(4):  # the noise and the estimate depend on each other
-        state, converged = _descend(problem, state, noise_px)
+        state = _descend(problem, state, noise_px)
         found = _noise(problem, state)
         settled = k > 0 and abs(found / noise_px - 1) < 0.1
         noise_px = found
         if settled:
             break
-    return Solved(state, noise_px, problem.equations(state, noise_px).reduced(), problem.slices, converged)
+    return Solved(state, noise_px, problem.equations(state, noise_px).reduced(), problem.slices)
 
 
-def _descend(problem: _Problem, state: State, noise_px: float) -> tuple[State, bool]:
+def _descend(problem: _Problem, state: State, noise_px: float) -> State:
     damping, cost = 1e-3, problem.cost(state, noise_px)
-    for _ in range(_MOST_ROUNDS):
+    while True:
         equations = problem.equations(state, noise_px)
         while True:
             try:
@@ -180,12 +178,11 @@ def _descend(problem: _Problem, state: State, noise_px: float) -> tuple[State, b
                 break
             damping *= 8
             if damping > 1e8:
-                return state, True
+                return state
         done = cost - new < _ENOUGH * max(cost, 1e-9)
         state, cost, damping = moved, new, max(damping / 8, 1e-9)
         if done:
-            return state, True
-    return state, False
+            return state
 
 
 def _noise(problem: _Problem, state: State) -> float:

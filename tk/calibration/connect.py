@@ -15,9 +15,8 @@ from tk.errors import CalibrationError
 
 Float = NDArray[np.float64]
 
-#: two estimates of the pose of a camera in another agree if they differ by less than this, degrees and share of the
-#: cameras' distance (or metres below one metre)
-_AGREE_DEG, _AGREE = 5.0, 0.12
+#: two estimates of the pose of a board in a camera agree if they differ by less than this: 12 % of its distance, 7°
+_AGREE = 0.12
 
 
 @dataclass(frozen=True)
@@ -49,13 +48,17 @@ def find_links(fitted: Sequence[Fitted]) -> list[Link]:
 
 def _link(a: int, b: int, shared: Sequence[int], one: Mapping[int, Pose], other: Mapping[int, Pose]) -> Link:
     poses = [one[i] @ other[i].inverse() for i in shared]
-    far = np.median([np.linalg.norm(pose.translation) for pose in poses])
-    turns = np.array([[angle_deg(p.rotation, q.rotation) for q in poses] for p in poses])
-    moves = np.array([[np.linalg.norm(p.translation - q.translation) for q in poses] for p in poses])
-    score = turns / _AGREE_DEG + moves / (_AGREE * max(float(far), 1.0))
-    best = int(np.argmin(np.minimum(score, 2.0).sum(axis=1)))
-    near = np.flatnonzero(score[best] < 2.0)
+    apart = np.array([[_apart(pose @ other[i], one[i]) for i in shared] for pose in poses])
+    best = int(np.argmin(np.minimum(apart, _AGREE).sum(axis=1)))
+    near = np.flatnonzero(apart[best] < _AGREE)
     return Link(a, b, tuple(shared), tuple(shared[int(k)] for k in near), poses[best])
+
+
+def _apart(p: Pose, q: Pose) -> float:
+    """Return by how much two poses of a board in a camera differ: the distance of its places as a share of its distance
+    from the camera, and the angle between its directions in radians."""
+    move = np.linalg.norm(p.translation - q.translation) / np.linalg.norm(q.translation)
+    return float(np.hypot(move, np.radians(angle_deg(p.rotation, q.rotation))))
 
 
 def connect(names: Sequence[str], fitted: Sequence[Fitted], links: Sequence[Link]) -> State:
@@ -78,20 +81,14 @@ def connect(names: Sequence[str], fitted: Sequence[Fitted], links: Sequence[Link
             raise CalibrationError(_unconnected(names, fitted, links, set(cameras)))
     boards: dict[int, Pose] = {}
     for instant in sorted({instant for one in fitted for instant in one.poses}):
-        candidates = [cameras[c].inverse() @ one.poses[instant] for c, one in enumerate(fitted) if instant in one.poses]
-        boards[instant] = _medoid(candidates)
-    return State(tuple(one.lens for one in fitted), tuple(cameras[c] for c in range(len(fitted))), boards)
-
-
-def _medoid(poses: Sequence[Pose]) -> Pose:
-    def apart(p: Pose) -> float:
-        return sum(
-            min(angle_deg(p.rotation, q.rotation) / _AGREE_DEG, 3.0)
-            + min(float(np.linalg.norm(p.translation - q.translation)) / _AGREE, 3.0)
-            for q in poses
+        seen = {c: one.poses[instant] for c, one in enumerate(fitted) if instant in one.poses}
+        candidates = [cameras[c].inverse() @ pose for c, pose in seen.items()]
+        # the one that fits most cameras' views
+        boards[instant] = min(
+            candidates,
+            key=lambda board: sum(min(_apart(cameras[c] @ board, pose), _AGREE) for c, pose in seen.items()),
         )
-
-    return min(poses, key=apart)
+    return State(tuple(one.lens for one in fitted), tuple(cameras[c] for c in range(len(fitted))), boards)
 
 
 def _unconnected(names: Sequence[str], fitted: Sequence[Fitted], links: Sequence[Link], known: set[int]) -> str:

@@ -16,15 +16,10 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Model:
-    """A lens model and the priors of its intrinsics.
-
-    The priors only matter where the images determine nothing. Their standard deviations are wide: lenses of phones,
-    webcams and action cameras lie within one of them.
-    """
+    """A lens model."""
 
     name: str
     names: tuple[str, ...]  # names of the distortion's numbers
-    sigmas: tuple[float, ...]  # standard deviations of the distortion's numbers about 0
     fisheye: bool = False
 
     @property
@@ -32,10 +27,15 @@ class Model:
         """Number of intrinsics."""
         return 4 + len(self.names)
 
+    @property
+    def sigmas(self) -> Float:
+        """(K - 4,) standard deviations of the priors of the distortion's numbers about 0."""
+        return np.array([RADIAL_SIGMA if name.startswith("k") else TANGENTIAL_SIGMA for name in self.names])
 
-PINHOLE5 = Model("pinhole5", ("k1", "k2", "p1", "p2", "k3"), (0.5, 0.5, 0.005, 0.005, 0.3))
-PINHOLE8 = Model("pinhole8", (*PINHOLE5.names, "k4", "k5", "k6"), (*PINHOLE5.sigmas, 0.5, 0.3, 0.2))
-FISHEYE = Model("fisheye", ("k1", "k2", "k3", "k4"), (0.2, 0.2, 0.1, 0.1), fisheye=True)
+
+PINHOLE5 = Model("pinhole5", ("k1", "k2", "p1", "p2", "k3"))
+PINHOLE8 = Model("pinhole8", (*PINHOLE5.names, "k4", "k5", "k6"))
+FISHEYE = Model("fisheye", ("k1", "k2", "k3", "k4"), fisheye=True)
 
 #: models to choose from, the one with fewer numbers first: a later one must fit clearly better
 CHOICE = (PINHOLE5, FISHEYE, PINHOLE8)
@@ -45,6 +45,9 @@ MODELS = {model.name: model for model in CHOICE}
 #: image's width. Pixels are square in all common cameras; a principal point lies within 3 % of the centre, except in
 #: cropped images.
 FOCAL_SIGMA, ASPECT_SIGMA, MIDDLE_SIGMA = 0.5, 0.002, 0.02
+#: standard deviations of the priors of radial and tangential distortion. They are wide, and only matter where the
+#: images determine nothing: lenses of phones, webcams and action cameras lie within one of them.
+RADIAL_SIGMA, TANGENTIAL_SIGMA = 0.3, 0.005
 
 
 def project(model: Model, lens: Float, p_camera: Float) -> tuple[Float, Float, Float]:

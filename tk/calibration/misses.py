@@ -27,8 +27,6 @@ _LIKELY = 4
 _SIZES = range(3, 15)
 #: mean distance of markers from their places on a board of the right size, share of a marker's side
 _FITS = 0.25
-#: images are searched at these shares of their size: blur disappears
-_SHRUNK = (0.5, 0.25, 0.125)
 #: boards with markers
 _MARKED = ("charuco", "aprilgrid")
 
@@ -80,12 +78,13 @@ def _mirrored(grey: Grey, board: Board) -> str | None:
 
 
 def _blurred(grey: Grey, board: Board) -> str | None:
-    for share in _SHRUNK:
-        small = cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
-        if detect(np.asarray(small, np.uint8), board) is not None:
+    small = grey
+    while min(small.shape) > 2 * max(board.columns, board.rows):  # a square has two pixels: smaller ones show nothing
+        small = np.asarray(cv2.pyrDown(small), np.uint8)
+        if detect(small, board) is not None:
             return (
-                f"one is found at {share:g} of the images' size: they are blurred or noisy: focus the camera, hold the "
-                "board still, add light"
+                f"one is found at {len(small) / len(grey):.2g} of the images' size: they are blurred or noisy: focus "
+                "the camera, hold the board still, add light"
             )
     return None
 

@@ -24,8 +24,6 @@ PAPERS = _papers()
 _EDGE_MM, _TEXT_MM = 8.0, 14.0
 #: PostScript points in a millimetre
 _POINT = 72 / 25.4
-#: control points of a quarter circle's Bézier curve, share of the radius
-_ARC = 0.5522847498
 
 SHEET = Kind("a PDF", (".pdf",), looks_like(rb"%PDF-"))
 
@@ -60,11 +58,12 @@ def write_sheet(path: Path, board: Board, paper: str, force: bool) -> None:
     if across > width - _EDGE_MM or down > height - _TEXT_MM:
         raise ConfigError(f"--square: a board of {across:.0f}x{down:.0f} mm is larger than {paper}; leave --square out")
     left, top = (width - across) / 2, (height - _TEXT_MM - down) / 2
-    lines = ["0 g"]
+    lines = ["0 g 0 G 1 J"]  # black, a pen with a round tip
     for shape in board.shapes():
         x, y = left + 1000 * shape.x, height - top - 1000 * (shape.y + shape.height)
         if shape.round:
-            lines.append(_circle(x + 500 * shape.width, y + 500 * shape.height, 500 * shape.width))
+            dot = f"{_pt(x + 500 * shape.width)} {_pt(y + 500 * shape.height)}"
+            lines.append(f"{_pt(1000 * shape.width)} w {dot} m {dot} l S")
         else:
             lines.append(f"{_pt(x)} {_pt(y)} {_pt(1000 * shape.width)} {_pt(1000 * shape.height)} re f")
     options = f"--board {board.kind} --size {board.columns}x{board.rows} --square {board.square_m:g}"
@@ -86,14 +85,6 @@ def write_sheet(path: Path, board: Board, paper: str, force: bool) -> None:
 
 def _pt(millimetres: float) -> str:
     return f"{millimetres * _POINT:.4f}"
-
-
-def _circle(x: float, y: float, r: float) -> str:
-    k, parts = _ARC * r, [f"{_pt(x + r)} {_pt(y)} m"]
-    corners = ((r, k, k, r, 0, r), (-k, r, -r, k, -r, 0), (-r, -k, -k, -r, 0, -r), (k, -r, r, -k, r, 0))
-    for a, b, c, d, e, f in corners:
-        parts.append(" ".join(_pt(v) for v in (x + a, y + b, x + c, y + d, x + e, y + f)) + " c")
-    return " ".join([*parts, "f"])
 
 
 def _escaped(text: str) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.inspection.delays import REACH, find_delays, in_frames
-from tk.inspection.leveling import SAME_DEG, find_up
+from tk.inspection.leveling import find_up
 from tk.inspection.people import PeopleWatch, many_people
 from tk.inspection.results import CameraReport, Inspection, Sample
 from tk.io.captures.capture import Capture
@@ -27,6 +27,7 @@ from tk.kernels.mask_values import PERSON
 from tk.model.body.plausibility import fits_height
 from tk.model.cameras.common_view import sample_box, views_of
 from tk.model.cameras.landmark_agreement import consensus, trunk
+from tk.model.cameras.mounting import SNAP_DEG
 from tk.model.cameras.up import shown, up_vector
 from tk.model.cameras.volume import Volume
 from tk.model.hull.coarse import Hull
@@ -332,7 +333,7 @@ def _findings(found: Inspection, capture: Capture, agreement: Agreement, denied:
     if found.leveling.person and not found.leveling.decided:
         lines.append(f"up = {shown(capture.up)}: {found.leveling.how}")
     tilt = np.degrees(np.arccos(np.clip(capture.up_axis @ up_vector(found.leveling.up), -1.0, 1.0)))
-    if tilt > SAME_DEG:
+    if tilt > SNAP_DEG:
         lines.append(
             f"up = {shown(capture.up)} differs by {tilt:.0f}° from the estimate from cameras and person, "
             f"{shown(found.leveling.up)}: tk calibrate --level writes the estimate to capture.toml"

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from tk.inspection.people import PersonReport
 from tk.io.captures.capture import Capture
 from tk.model.body.skeleton import up_rotation
-from tk.render.canvas import write
+from tk.render.canvas import LINE, write
 from tk.render.palette import INK, PAPER, VOLUME, WIRE, person_color
 
 Float = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-#: layout of the floor plan, pixels: longest side, margin, height of a line of text. Appearance only.
-_SIDE, _MARGIN, _LINE = 900, 60, 24
+#: layout of the floor plan, pixels: longest side, margin. Appearance only.
+_SIDE, _MARGIN = 900, 60
 
 
 def floor_plan(capture: Capture, people: Sequence[PersonReport]) -> Image:
@@ -35,7 +35,7 @@ def floor_plan(capture: Capture, people: Sequence[PersonReport]) -> Image:
     low, high = shown.min(axis=0), shown.max(axis=0)
     scale = _SIDE / float((high - low).max())
     width, height = (round(float(side)) for side in (high - low) * scale + 2 * _MARGIN)
-    image = np.full((height + _LINE * (len(people) + 2), max(width, _SIDE), 3), PAPER, np.uint8)
+    image = np.full((height + LINE * (len(people) + 2), max(width, _SIDE), 3), PAPER, np.uint8)
 
     def pixel(point: Float) -> tuple[int, int]:
         x, y = (point - low) * scale + _MARGIN
@@ -66,5 +66,5 @@ def floor_plan(capture: Capture, people: Sequence[PersonReport]) -> Image:
     x, y = corners.reshape(-1, 2).min(axis=0).tolist()
     write(image, "working volume", x, y - 8, VOLUME)
     for k, person in enumerate(people):
-        write(image, person.line(len(capture.rig)), 10, height + _LINE * (k + 1), person_color(person.number))
+        write(image, person.line(len(capture.rig)), 10, height + LINE * (k + 1), person_color(person.number))
     return np.asarray(image, np.uint8)

@@ -21,7 +21,7 @@ from tk.errors import CaptureError
 from tk.io.captures.scene import UP_AGREE_DEG
 from tk.io.paths import replacing
 from tk.io.toml import parse_toml, read_text
-from tk.model.cameras.mounting import FoundUp
+from tk.model.cameras.mounting import SNAP_DEG, FoundUp
 from tk.model.cameras.up import UP_AXES, shown, up_text, up_vector
 
 Float = NDArray[np.float64]
@@ -32,8 +32,6 @@ _LONG = 1.6
 _LEVEL_DEG, _ROLLED_DEG = 2.0, 8.0
 #: metres, largest second standard deviation of one person's voxels: several people, or a table, are wider
 _WIDE_M = 0.35
-#: directions that differ by less are the same, degrees
-SAME_DEG = 10.0
 #: percentile of the voxels' heights that is the floor; lower voxels come from specks in the masks
 _FLOOR_PERCENTILE = 0.5
 
@@ -90,7 +88,7 @@ def _decide(cameras: FoundUp, given: Float, person: Float | None, axes: Sequence
     """
     rough = up_vector(cameras.up)
     if person is None:
-        if cameras.sure and (cameras.level or _degrees(rough, given) <= SAME_DEG):
+        if cameras.sure and (cameras.level or _degrees(rough, given) <= SNAP_DEG):
             return rough, cameras.how, True
         why = f"{cameras.how}, and nobody stands alone in view"
         return given, f"it cannot be decided: {why}", False
@@ -99,7 +97,7 @@ def _decide(cameras: FoundUp, given: Float, person: Float | None, axes: Sequence
         if from_given <= UP_AGREE_DEG:
             axis = any(np.array_equal(given, up_vector(name)) for name in UP_AXES)
             how = f"as the person stands, {from_given:.0f}° from the capture's; {cameras.how}"
-            return (given if axis and from_given <= SAME_DEG else person), how, True
+            return (given if axis and from_given <= SNAP_DEG else person), how, True
         return given, f"it cannot be decided: the axis of the person differs by {from_given:.0f}°; {cameras.how}", False
     apart = _degrees(person, rough)
     if apart > UP_AGREE_DEG:

@@ -17,15 +17,15 @@ from tk.io.captures.capture import Capture
 from tk.kernels.mask_values import PERSON
 from tk.model.cameras.camera import Camera
 from tk.model.cameras.up import up_vector
-from tk.render.canvas import text_width, write, write_png
+from tk.render.canvas import LINE, TILE, text_width, write, write_png
 from tk.render.overlay import joined
 from tk.render.palette import INK, LOST, PAPER, VOLUME, of_hue
 
 Image = NDArray[np.uint8]
 Float = NDArray[np.float64]
 
-#: layout, pixels: height of a tile, height of a line of text, width of a column of a terminal
-_TILE, _LINE, _COLUMN = 300, 20, 9
+#: width of a column of a terminal, pixels
+_COLUMN = 9
 _MASK, _HULL, _UP = of_hue(120.0), of_hue(300.0), of_hue(45.0)
 _LEGEND = (
     ("mask", _MASK),
@@ -54,10 +54,10 @@ def _text(inspection: Inspection, width: int) -> Image:
     lines += [(line, LOST) for line in inspection.findings] or [("No problems found.", of_hue(120.0, 0.4))]
     lines += [(f"note: {line}", INK) for line in inspection.notes]
     wrapped = [(part, color) for line, color in lines for part in _wrapped(line, width - 20)]
-    image = np.full(((len(wrapped) + 2) * _LINE, width, 3), 255, np.uint8)
+    image = np.full(((len(wrapped) + 2) * LINE, width, 3), 255, np.uint8)
     for i, (line, color) in enumerate(wrapped):
-        _columns(image, line, (i + 1) * _LINE, color)
-    x, y = 10, (len(wrapped) + 1) * _LINE
+        _columns(image, line, (i + 1) * LINE, color)
+    x, y = 10, (len(wrapped) + 1) * LINE
     for name, color in _LEGEND:
         cv2.line(image, (x, y - 5), (x + 24, y - 5), color, 3, cv2.LINE_AA)
         x = write(image, name, x + 30, y, INK) + 20
@@ -112,14 +112,14 @@ def _tile(capture: Capture, inspection: Inspection, frame: Sample, c: int) -> Im
     if np.isfinite(inspection.leveling.floor_m):
         foot = foot + up * (inspection.leveling.floor_m - foot @ up)
     _segment(picture, camera, foot, foot + up, _UP, 2 * thick)
-    scale = _TILE / camera.height
-    tile = cv2.resize(picture, (round(camera.width * scale), _TILE), interpolation=cv2.INTER_AREA)
+    scale = TILE / camera.height
+    tile = cv2.resize(picture, (round(camera.width * scale), TILE), interpolation=cv2.INTER_AREA)
     report = inspection.cameras[c]
     name = f"{camera.name}  frame {frame.index}"
     cv2.rectangle(tile, (0, 0), (text_width(name, 0.5) + 14, 24), INK, cv2.FILLED)
     write(tile, name, 7, 17, PAPER, 0.5)
     if report.verdict:
-        cv2.rectangle(tile, (0, 0), (tile.shape[1] - 1, _TILE - 1), LOST, 4)
+        cv2.rectangle(tile, (0, 0), (tile.shape[1] - 1, TILE - 1), LOST, 4)
     return np.asarray(tile, np.uint8)
 
 

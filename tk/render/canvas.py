@@ -25,6 +25,8 @@ Image = NDArray[np.uint8]
 _FILL = 0.35  # opacity of the body
 #: what a view of points shows, as a multiple of their span: the body may be smaller than the person
 AROUND = 1.2
+#: height of a picture, and of a line of text, in a sheet of pictures, pixels
+TILE, LINE = 300, 24
 #: fractional bits of OpenCV's drawing coordinates
 SUBPIXEL_BITS = 4
 _FONT = cv2.FONT_HERSHEY_SIMPLEX

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from tk.model.cameras.camera import Camera
 from tk.synchronise.empty import runs
 from tk.synchronise.lags import correlate
-from tk.synchronise.looks import SOMEBODY, Look
-from tk.synchronise.person import DOUBT, GRID_HZ, NEAR_S, common_deviation, planes_sum, rays_of, shared_planes
+from tk.synchronise.looks import GRID_HZ, SOMEBODY, Look
+from tk.synchronise.person import DOUBT, NEAR_S, common_deviation, planes_sum, rays_of, shared_planes
 from tk.synchronise.raw import SHORTEST_S, Recording
 from tk.synchronise.sound import Heard
 from tk.synchronise.ties import Clocks, Tie

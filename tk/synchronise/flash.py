@@ -13,11 +13,12 @@ from dataclasses import dataclass
 from itertools import combinations, groupby
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from tk.io.captures.timing import image_interval
 from tk.synchronise.looks import Look
-from tk.synchronise.ties import Tie, connected_to
+from tk.synchronise.ties import Tie
 
 Float = NDArray[np.float64]
 
@@ -27,18 +28,15 @@ _TIMES_COMMON, _LEAST = 8.0, 4.0
 _SHARE = 0.5
 #: most changes of a recording that are compared; a disco is none
 _MOST_EVENTS = 12
-#: a lone change convinces if it is so many times the second largest of the camera
-_LONE = 3.0
-#: a change continues in the image before or after if that changes the same way by so many times the common change
-_CONTINUES = 3.0
+#: a lone change convinces if it is so many times the second largest of the camera; a change continues in the image
+#: before or after if that changes the same way by so many times the common change
+_CLEARLY = 3.0
 #: standard deviation of the share of an exposure that saw the light: rows that are read later, and the gamma of cameras
 _SHARE_SIGMA = 0.1
 #: seconds of changes that give one offset: clocks drift apart by 2 ms at most
 _TOGETHER_S = 30.0
 #: samples of an interval, and lengths of the exposure as shares of a camera's interval, in the likelihood
 _STEPS, _LENGTHS = 60, np.linspace(0.1, 1.0, 10)
-#: samples that are left out, and those that count. With five times as many, offsets differ by less than 0.5 ms.
-_SKIPPED, _DRAWN = 100, 600
 
 
 @dataclass(frozen=True)
@@ -85,7 +83,7 @@ def find_events(look: Look) -> list[Event]:
             k += 1
             continue
         first = last = k  # up to three steps: images that saw the light for a part of their exposure
-        along = steps * np.sign(steps[k]) > _CONTINUES * common
+        along = steps * np.sign(steps[k]) > _CLEARLY * common
         first -= k > 0 and bool(along[k - 1]) and not large[k - 1]
         last += k + 1 < len(steps) and bool(along[k + 1])
         if (event := _event(look, first, last, common)) is not None:
@@ -168,68 +166,36 @@ def _match(one: Sequence[Event], other: Sequence[Event]) -> list[tuple[int, int]
     if best and (len(best) <= second or len(best) < 2):
         for event, events in ((one[best[0][0]], one), (other[best[0][1]], other)):
             rest = [abs(each.change) for each in events if abs(each.own_s - event.own_s) > 0.5]
-            if abs(event.change) <= _LONE * max(rest, default=0.0):
+            if abs(event.change) <= _CLEARLY * max(rest, default=0.0):
                 return []
     return best
 
 
 def ties_of_changes(changes: Sequence[Mapping[int, Event]]) -> list[Tie]:
-    """Return ties between the first and the other cameras that some changes of the light give together.
-
-    The unknowns are the instants of the changes, and each camera's offset and exposure. Samples of them are drawn in
-    turn from their distributions given all others (Gibbs sampling); the tie is mean and deviation of an offset.
-    """
-    members = [set(change) for change in changes]
-    cameras = sorted(set[int]().union(*members))
-    linked = connected_to(cameras[0], cameras[-1] + 1, [(min(m), c) for m in members for c in m if c != min(m)])
-    cameras = [c for c in cameras if linked[c]]
-    changes = [{c: change[c] for c in cameras if c in change} for change in changes if linked[min(change)]]
-    if len(cameras) < 2:
-        return []
-    # common times: of the first camera; the offsets of the others to begin with
-    offsets = {cameras[0]: 0.0}
-    while len(offsets) < len(cameras):
-        for change in changes:
-            known = next((c for c in change if c in offsets), None)
-            for c in () if known is None else change:
-                offsets.setdefault(c, change[known].own_s + offsets[known] - change[c].own_s)  # type: ignore[index]
-    every = [event for change in changes for event in change.values()]
-    step = float(min(event.interval_s for event in every)) / _STEPS
-    reach = round(2 * max(event.gap_s for event in every) / step)
-    grid = np.arange(-2 * reach, 2 * reach + 1, dtype=np.float64) * step
-    middle = [float(np.mean([event.own_s + offsets[c] for c, event in change.items()])) for change in changes]
-    log = [
-        {c: np.log(np.maximum(event.likelihood(at - offsets[c] + grid), 1e-12)) for c, event in change.items()}
-        for at, change in zip(middle, changes, strict=True)
-    ]
-    random = np.random.default_rng(0)
-
-    def draw(values: Float) -> int:
-        total = np.exp(values - values.max()).ravel().cumsum()
-        return int(np.searchsorted(total, random.random() * total[-1]))
-
-    span = np.arange(-reach, reach + 1)
-    instant = [0] * len(changes)  # samples of the grid, from the middle
-    moved, length = dict.fromkeys(cameras, 0), dict.fromkeys(cameras, len(_LENGTHS) // 2)
-    sums = {c: np.zeros(2) for c in cameras}
-    for n in range(_SKIPPED + _DRAWN):
-        for k, tables in enumerate(log):
-            at = sum(table[length[c], 2 * reach + span - moved[c]] for c, table in tables.items())
-            instant[k] = int(span[draw(np.asarray(at))])
-        for c in cameras:
-            moves = span if c != cameras[0] else np.zeros(1, int)
-            seen = [(k, tables[c]) for k, tables in enumerate(log) if c in tables]
-            both = sum(table[:, 2 * reach + instant[k] - moves] for k, table in seen)
-            both = np.asarray(both)
-            length[c], at_move = divmod(draw(both), len(moves))
-            moved[c] = int(moves[at_move])
-            if n >= _SKIPPED:
-                density = np.exp(both - both.max()).sum(axis=0)
-                sums[c] += [density @ moves / density.sum(), density @ moves**2 / density.sum()]
+    """Return a tie of each two cameras that some changes of the light give together."""
     ties = []
-    for c in cameras[1:]:
-        mean, square = sums[c] / _DRAWN
-        own = float(np.mean([change[c].own_s for change in changes if c in change]))
-        sigma = step * float(np.sqrt(max(square - mean**2, 0.0) + 1))
-        ties.append(Tie(cameras[0], c, own + offsets[c] + step * float(mean), own, sigma, "flash"))
+    for i, j in combinations(sorted(set[int]().union(*changes)), 2):
+        both = [(change[i], change[j]) for change in changes if i in change and j in change]
+        if both:
+            ties.append(_tie(i, j, both))
     return ties
+
+
+def _tie(i: int, j: int, both: Sequence[tuple[Event, Event]]) -> Tie:
+    """Return the tie of two cameras by changes that both saw: mean and deviation of the likelihood of its lag, which is
+    summed over the instants of the changes and over the lengths of both exposures."""
+    own_i, own_j = np.mean([[a.own_s, b.own_s] for a, b in both], axis=0).tolist()
+    every = [event for pair in both for event in pair]
+    step = min(event.interval_s for event in every) / _STEPS
+    reach = round(2 * max(event.gap_s for event in every) / step)
+    lags, wide = step * np.arange(-reach, reach + 1), step * np.arange(-2 * reach, 2 * reach + 1)
+    log: Float | float = 0.0
+    for a, b in both:
+        middle = (a.own_s + b.own_s + own_i - own_j) / 2
+        later = sliding_window_view(b.likelihood(middle - own_i + own_j + wide), len(lags), axis=1)
+        log = log + np.log(np.tensordot(a.likelihood(middle + lags), later, (1, 2)) + 1e-300)
+    density = np.exp(log - np.max(log)).sum(axis=(0, 1))
+    density /= density.sum()
+    mean = float(density @ lags)
+    sigma = float(np.sqrt(density @ (lags - mean) ** 2 + step**2))
+    return Tie(i, j, own_i - mean, own_j, sigma, "flash")

@@ -23,8 +23,10 @@ Image = NDArray[np.uint8]
 
 #: longer side of the small images, pixels.
 SIDE_PX = 160
-#: seconds of each recording that are looked at, and highest rate, 1/s. Offsets up to a minute leave two in common.
-LOOKED_S, _MOST_HZ = 180.0, 62.0
+#: seconds of each recording that are looked at. Offsets up to a minute leave two in common.
+LOOKED_S = 180.0
+#: 1/s: of the clock on which signals are compared; images are looked at with up to half of it
+GRID_HZ = 120
 #: grey levels by which a pixel must change from image to image, beyond the noise, to count as moving; and a level above
 #: which a change counts no more: reflections
 _MOVES, _MOST = 3.0, 40.0
@@ -102,7 +104,7 @@ def look_at(recording: Recording, begin_s: float | None = None, length_s: float 
     for time, image in _images(recording, begin, begin + length_s):
         if times and time - times[-1] < least:
             continue
-        least = 0.9 / _MOST_HZ
+        least = 0.9 * 2 / GRID_HZ
         scale = SIDE_PX / max(image.width, image.height)
         size = max(round(image.width * scale), 2), max(round(image.height * scale), 2)
         small = image.reformat(*size, format="gray", interpolation="AREA").to_ndarray()

@@ -18,14 +18,12 @@ from scipy.ndimage import gaussian_filter1d
 
 from tk.model.cameras.camera import Camera
 from tk.synchronise.lags import correlate
-from tk.synchronise.looks import Look
+from tk.synchronise.looks import GRID_HZ, Look
 from tk.synchronise.raw import SHORTEST_S
 from tk.synchronise.ties import Tie, connected_to
 
 Float = NDArray[np.float64]
 
-#: 1/s: of the clock on which signals are compared
-GRID_HZ = 120
 #: seconds by which a lag may differ from the best one and be the same: twice the width of most motions. Twice as many
 #: change no answer of :mod:`tk.synchronise.faults`; with half of it, one of 11 right folders has a false speed.
 NEAR_S = 0.35

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import filecmp
 import re
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -29,8 +30,6 @@ SHORTEST_S = 2.0
 _GOPRO = re.compile(r"G[HXSL](\d\d)(\d{4})$", re.IGNORECASE)
 #: seconds by which a chapter may be created later than the end of the one before: whole seconds, and writing files
 _CREATED_S = 5.0
-#: bytes at both ends by which files are compared
-_COMPARED = 1 << 16
 _TIMECODE = re.compile(r"(\d\d):(\d\d):(\d\d)([:;.])(\d+)$")
 
 
@@ -109,15 +108,9 @@ def read_raw(folder: Path, cameras: Sequence[str] | None = None) -> list[Recordi
 
 
 def _check_different(files: Sequence[Path]) -> None:
-    """Raise CaptureError if two files are the same, by their size, beginning and end."""
-    seen: dict[tuple[int, bytes, bytes], Path] = {}
-    for path in files:
-        size = path.stat().st_size
-        with path.open("rb") as file:
-            begin = file.read(_COMPARED)
-            file.seek(max(size - _COMPARED, 0))
-            other = seen.setdefault((size, begin, file.read()), path)
-        if size and other != path:
+    """Raise CaptureError if two files are the same."""
+    for other, path in combinations(files, 2):
+        if path.stat().st_size and filecmp.cmp(other, path, shallow=False):
             raise CaptureError(f"{path}: is the same file as {other}; each camera, and each chapter, needs its own")
 
 

@@ -11,18 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
-from tk.render.canvas import text_width, write, write_png
+from tk.render.canvas import LINE, TILE, text_width, write, write_png
 from tk.render.palette import INK, PAPER
-from tk.synchronise.looks import Look, pictures_at
-from tk.synchronise.person import GRID_HZ
+from tk.synchronise.looks import GRID_HZ, Look, pictures_at
 from tk.synchronise.raw import Recording
 from tk.synchronise.ties import Clocks
 
 Float = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-#: height of a picture, of the text above a row, and most width of a picture, pixels
-_HEIGHT, _LINE, _MOST_WIDTH = 300, 26, 540
+#: most width of a picture, pixels
+_MOST_WIDTH = 540
 #: instants, and seconds between them and the fastest one
 _INSTANTS, _APART_S = 3, 0.3
 
@@ -56,14 +55,14 @@ def write_sheet(path: Path, recordings: Sequence[Recording], clocks: Clocks, ins
 
     def pictures(c: int) -> list[Image]:
         owns = [(at - float(clocks.offsets_s[c])) / float(clocks.rates[c]) for at in instants]
-        return pictures_at(recordings[c], owns, _HEIGHT)
+        return pictures_at(recordings[c], owns, TILE)
 
     with ThreadPoolExecutor(2) as threads:
         columns = list(threads.map(pictures, range(len(recordings))))
     rows = []
     for k, at in enumerate(instants):
         row = np.concatenate([_cut(column[min(k, len(column) - 1)]) for column in columns], axis=1)
-        head = np.full((_LINE, row.shape[1], 3), PAPER, np.uint8)
+        head = np.full((LINE, row.shape[1], 3), PAPER, np.uint8)
         x = 0
         for recording, column, c in zip(recordings, columns, range(len(columns)), strict=True):
             own = (at - float(clocks.offsets_s[c])) / float(clocks.rates[c])
@@ -71,7 +70,7 @@ def write_sheet(path: Path, recordings: Sequence[Recording], clocks: Clocks, ins
             text = f"{name}  {own:.2f} s of its own" + (f"   common time {at:.2f} s" if c == 0 else "")
             width = _cut(column[0]).shape[1]
             size = 0.42 * min(1.0, (width - 12) / max(text_width(text), 1))
-            write(head, text, x + 6, _LINE - 9, INK, size)
+            write(head, text, x + 6, LINE - 8, INK, size)
             x += width
         rows += [head, row]
     write_png(path, np.concatenate(rows, axis=0), CaptureError)

@@ -15,7 +15,7 @@ from scipy.signal import butter, find_peaks, sosfiltfilt
 from tk.io.captures.packets import open_video
 from tk.synchronise.lags import correlate, fast_length
 from tk.synchronise.raw import SHORTEST_S, Recording
-from tk.synchronise.ties import Tie
+from tk.synchronise.ties import OUTLIER_SIGMA, RATE_SIGMA, Tie
 
 Float = NDArray[np.float64]
 Samples = NDArray[np.float32]
@@ -50,7 +50,7 @@ _WINDOW_SIGMA_S = 0.0003
 #: quieter tracks, of full scale, hold nothing: rounding alone is 1e-5
 _SILENCE = 1e-4
 #: largest drift between two cameras, relative
-_MOST_DRIFT = 150e-6
+_MOST_DRIFT = OUTLIER_SIGMA * RATE_SIGMA
 
 
 @dataclass(frozen=True)

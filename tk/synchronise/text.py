@@ -10,7 +10,6 @@ from tk.errors import ConfigError
 from tk.synchronise.capture_file import common_span
 from tk.synchronise.empty import find_empty
 from tk.synchronise.run import Synchronised
-from tk.synchronise.ties import KNOWN_RATE
 
 
 def table(done: Synchronised) -> str:
@@ -43,7 +42,7 @@ def _drift(done: Synchronised, c: int) -> str:
     sigma = float(done.clocks.rate_sigma[c])
     if c == 0:
         return "0"
-    if not sigma < KNOWN_RATE:
+    if np.isnan(sigma):
         return "not determined"
     return f"{_no_minus_zero(1e6 * (done.clocks.rates[c] - 1), 0):+.0f} ± {1e6 * sigma:.0f} ppm"
 
@@ -62,7 +61,7 @@ def to_dict(done: Synchronised) -> dict[str, Any]:
     cameras = {}
     for c, recording in enumerate(done.recordings):
         sure = c not in (decision.unsure | decision.faulty)
-        rated = bool(clocks.rate_sigma[c] < KNOWN_RATE) and c > 0
+        rated = bool(np.isfinite(clocks.rate_sigma[c])) and c > 0
         cameras[recording.name] = {
             "sure": sure,
             "offset_s": known(clocks.offsets_s[c]) if sure else None,

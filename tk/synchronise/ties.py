@@ -18,10 +18,6 @@ SOUND_SIGMA_S = 0.015
 #: two cameras are an outlier, and two methods contradict each other, if ties differ by more than so many sigma; two
 #: cameras by more than this, seconds, too
 OUTLIER_SIGMA, _OUTLIER_S = 5.0, 0.01
-#: a rate counts as determined if its standard deviation is below this, relative
-KNOWN_RATE = 15e-6
-#: prior of a rate that is not estimated, relative
-_FIXED = 1e-12
 
 
 @dataclass(frozen=True)
@@ -87,7 +83,7 @@ def solve(count: int, ties: Sequence[Tie], reference: int = 0, skew_sigma_s: flo
     kept = _not_counted_twice(ties)
     dropped: list[tuple[int, int, str]] = []
     while True:
-        clocks, residuals = _fit(count, kept, reference, skew_sigma_s, np.full(count, RATE_SIGMA))
+        clocks, residuals = _fit(count, kept, reference, skew_sigma_s)
         worst, size = None, 1.0
         for pair in {(tie.i, tie.j, tie.kind) for tie in kept}:
             own = [(r, tie) for r, tie in zip(residuals, kept, strict=True) if (tie.i, tie.j, tie.kind) == pair]
@@ -98,10 +94,7 @@ def solve(count: int, ties: Sequence[Tie], reference: int = 0, skew_sigma_s: flo
             if off > limit * size and same:
                 worst, size = pair, off / limit
         if worst is None:
-            rate_sigma = np.where(clocks.rate_sigma < KNOWN_RATE, RATE_SIGMA, _FIXED)
-            final, _ = _fit(count, kept, reference, skew_sigma_s, rate_sigma)
-            final.offsets_s[:] += 0.0  # no negative zero
-            return replace(final, rate_sigma=clocks.rate_sigma, dropped=tuple(dropped))
+            return replace(clocks, dropped=tuple(dropped))
         dropped.append(worst)
         kept = [tie for tie in kept if (tie.i, tie.j, tie.kind) != worst]
 
@@ -116,45 +109,29 @@ def _not_counted_twice(ties: Sequence[Tie]) -> list[Tie]:
     return [replace(tie, sigma_s=tie.sigma_s * max(factors[tie.kind], 1.0)) for tie in ties]
 
 
-def _fit(
-    count: int, ties: Sequence[Tie], reference: int, skew_sigma_s: float, rate_sigma: Float
-) -> tuple[Clocks, Float]:
-    """Return the clocks and the residual of each tie, seconds; ``rate_sigma`` (C,): prior of the rates."""
+def _fit(count: int, ties: Sequence[Tie], reference: int, skew_sigma_s: float) -> tuple[Clocks, Float]:
+    """Return the clocks and the residual of each tie, seconds; 0 of ties between cameras that are not connected."""
     known = connected_to(reference, count, [(tie.i, tie.j) for tie in ties])
-    used = [tie for tie in ties if known[tie.i]]
     middle = np.zeros(count)  # own times about which rates act, so that offsets and rates are nearly independent
     for c in range(count):
-        at = [tie.own_i if tie.i == c else tie.own_j for tie in used if c in (tie.i, tie.j)]
-        middle[c] = (min(at) + max(at)) / 2 if at else 0.0
-    rows, right = [], []
-    for tie in used:
-        row = np.zeros(3 * count)
-        for c, own, sign in ((tie.i, tie.own_i, 1.0), (tie.j, tie.own_j, -1.0)):
-            row[c] = sign
-            row[count + c] = sign * (own - middle[c])
-            row[2 * count + c] = -sign * (tie.kind == "sound")
-        rows.append(row / tie.sigma_s)
-        right.append((tie.own_j - tie.own_i) / tie.sigma_s)
-    for c in range(count):
-        prior_rate = _FIXED if c == reference else float(rate_sigma[c])
-        for k, sigma in ((count + c, prior_rate), (2 * count + c, skew_sigma_s)):
-            row = np.zeros(3 * count)
-            row[k] = 1 / sigma
-            rows.append(row)
-            right.append(0.0)
-        if c == reference or not known[c]:
-            row = np.zeros(3 * count)
-            row[c] = 1e9
-            rows.append(row)
-            right.append(0.0)
-    A, b = np.array(rows), np.array(right)
-    normal = np.linalg.inv(A.T @ A)
-    x = normal @ (A.T @ b)
+        at = [tie.own_i if tie.i == c else tie.own_j for tie in ties if c in (tie.i, tie.j)] or [0.0]
+        middle[c] = (min(at) + max(at)) / 2
+    rows, b = np.zeros((len(ties), 3, count)), np.zeros(len(ties))  # offsets, rates - 1, delays of the sound
+    for k, tie in enumerate(ties):
+        if known[tie.i]:
+            for c, own, sign in ((tie.i, tie.own_i, 1.0), (tie.j, tie.own_j, -1.0)):
+                rows[k, :, c] = sign, sign * (own - middle[c]), -sign * (tie.kind == "sound")
+            b[k] = tie.own_j - tie.own_i
+    precision = np.array([tie.sigma_s for tie in ties]) ** -2.0
+    A = rows.reshape(len(ties), 3 * count)
+    free = np.concatenate([known, np.ones(2 * count, bool)])
+    free[[reference, count + reference]] = False
+    prior = np.repeat([0.0, RATE_SIGMA**-2, skew_sigma_s**-2], count)
+    normal = np.zeros((3 * count, 3 * count))
+    normal[np.ix_(free, free)] = np.linalg.inv(((A.T * precision) @ A + np.diag(prior))[np.ix_(free, free)])
+    x = normal @ (A.T @ (precision * b))
     sigma = np.sqrt(np.maximum(np.diag(normal), 0.0))
-    residuals = np.full(len(ties), 0.0)
-    inner = A[: len(used)] @ x - b[: len(used)]
-    residuals[[k for k, tie in enumerate(ties) if known[tie.i]]] = inner * [tie.sigma_s for tie in used]
-    offsets = x[:count] - x[count : 2 * count] * middle
     nan = np.where(known, 0.0, np.nan)
-    clocks = Clocks(offsets + nan, 1.0 + x[count : 2 * count], sigma[:count] + nan, sigma[count : 2 * count])
-    return clocks, residuals
+    offsets = x[:count] - x[count : 2 * count] * middle + nan
+    clocks = Clocks(offsets, 1.0 + x[count : 2 * count], sigma[:count] + nan, sigma[count : 2 * count])
+    return clocks, A @ x - b

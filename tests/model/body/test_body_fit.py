@@ -20,7 +20,6 @@ from tk.model.body.body_points import LANDMARKS
 from tk.model.body.cone_body import SHAPE_NUMBERS, build_cone_body
 from tk.model.body.gait_poses import standing_pose, walking_pose
 from tk.model.body.skeleton import JOINTS, SEGMENTS
-from tk.model.cues.cue import information
 from tk.model.cues.landmarks import NAME
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Views
@@ -169,17 +168,16 @@ def test_part_transforms_of_many_poses_follow_the_skeleton(up):
         np.testing.assert_allclose(body.part_transforms(T)[:, p], expected, atol=1e-12)
 
 
-def test_lengths_of_a_known_body_are_recovered(monkeypatch):
-    """Silhouettes without noise: an edgel's error is below a pixel."""
-    monkeypatch.setattr(body_fit, "BUNDLE_INFORMATION", information(0.5))
+def test_lengths_of_a_known_body_are_recovered():
+    """The average body's lengths are off by 5 %."""
     # the wrist hardly shows, so forearm and hand keep their lengths
     true = scaled(AVERAGE.dimensions, thigh=0.95, calf=1.05, upper_arm=1.05, thigh_radius=1.1)
     body = build_cone_body(true)
-    poses = walk(body, 4)
+    poses = walk(body, 8)
     start = poses + np.random.default_rng(0).normal(0, 0.01, poses.shape)
     found, fitted, _ = fit_body(VIEWS, pyramids_of(body, poses), start, SEARCH, true.stature)
     for name in ("thigh", "calf", "upper_arm", "forearm"):
-        assert getattr(found.dimensions, name) == pytest.approx(getattr(true, name), rel=0.02), name
+        assert getattr(found.dimensions, name) == pytest.approx(getattr(true, name), rel=0.03), name
     off = [
         np.linalg.norm(found.skeleton.joints(a) - body.skeleton.joints(b), axis=1).mean()
         for a, b in zip(fitted, poses, strict=True)

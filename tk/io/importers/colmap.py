@@ -40,8 +40,8 @@ _MODELS = {
 #: folders in which COLMAP and programs around it leave a model
 _FOLDERS = ("", "sparse/0/", "sparse/", "colmap/", "colmap/sparse/0/", "colmap/sparse/", "model/", "calibration/")
 
-#: images of one camera that stands still differ by less: degrees, and share of the largest distance of two cameras
-_STILL_DEG, _STILL_SHARE = 0.5, 0.01
+#: images of one camera that stands still differ by less: radians, and share of the largest distance of two cameras
+_STILL = 0.01
 
 
 def _read(files: Sequence[Path]) -> Tables:
@@ -58,13 +58,13 @@ def _read(files: Sequence[Path]) -> Tables:
     apart = max((float(np.linalg.norm(a - b)) for *_, a in _all(poses) for *_, b in _all(poses)), default=0.0)
     for name, images in poses.items():
         lens_id, R, center = images[0]
-        turn = max(np.degrees(np.linalg.norm(scipy.spatial.transform.Rotation.from_matrix(other @ R.T).as_rotvec()))
-                   for _, other, _ in images)  # fmt: skip
+        turn = max(scipy.spatial.transform.Rotation.from_matrix(other @ R.T).magnitude() for _, other, _ in images)
         shift = max(float(np.linalg.norm(other - center)) for *_, other in images)
-        if turn > _STILL_DEG or shift > _STILL_SHARE * apart or any(other[0] != lens_id for other in images):
+        if turn > _STILL or shift > _STILL * apart or any(other[0] != lens_id for other in images):
             raise CalibrationError(
                 f"{found.source}: the {len(images)} images of camera {name!r} have different poses, up to "
-                f"{turn:.1f}° apart: a capture's cameras stand still; give each its own folder of images, or one image"
+                f"{np.degrees(turn):.1f}° apart: a capture's cameras stand still; give each its own folder of images, "
+                "or one image"
             )
         if len(images) > 1:
             found.notes.append(f"{found.source}: {len(images)} images of camera {name!r} have the same pose")

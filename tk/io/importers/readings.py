@@ -26,10 +26,9 @@ Y_UP = np.diag([1.0, -1.0, -1.0])
 
 #: degrees between a camera's axis and the direction to the place that all cameras look at, root mean square: half the
 #: field of view of a wide lens. The first reading is replaced if it has more, and another one half as much.
+#: So has one that replaces the first one because its cameras are upright: poses that are read in a wrong way may by
+#: chance look at one place, but not upright.
 _APART_DEG = 45.0
-#: most of it, degrees, of another reading that replaces the first one because its cameras are upright: poses that are
-#: read in a wrong way may by chance look at one place, but not upright
-_UPRIGHT_APART_DEG = 20.0
 
 
 def to_camera(R: Float, v: Float) -> tuple[Float, Float]:
@@ -84,7 +83,7 @@ def choose(found: Tables, readings: Mapping[str, Reading]) -> None:
     elif _upright(poses[first]):
         closer = []
     else:
-        closer = [name for name in closer if apart[name] < _UPRIGHT_APART_DEG and _upright(poses[name])]
+        closer = [name for name in closer if apart[name] < _APART_DEG / 2 and _upright(poses[name])]
     if len(closer) > 1 and apart[closer[1]] < 1.5 * apart[closer[0]] + 1.0:
         raise CalibrationError(
             f"{found.source}: in the first reading ({first}), its cameras look past each other, or lie on their side; "

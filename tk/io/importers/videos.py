@@ -19,9 +19,6 @@ _COMMON_WORDS = frozenset({"int", "ext", "img", "calib", "video", "synchronized"
 #: numbers have more digits
 _LEAST_DIGITS = 4
 
-#: files of a folder that are checked for images; a folder of images has them among its first files
-_CHECKED_FILES = 200
-
 
 @dataclass(frozen=True)
 class CameraNames:
@@ -97,11 +94,7 @@ def _clips_in(folder: Path, images: bool) -> dict[str, Path]:
     for below in _folders(folder):
         inside = _regular(below)
         videos = [path for path in inside if path.suffix.lower() in VIDEO_SUFFIXES]
-        numbered = [
-            path
-            for path in inside[:_CHECKED_FILES]
-            if path.suffix.lower() in PICTURE_SUFFIXES and re.search(r"[0-9]$", path.stem)
-        ]
+        numbered = any(path.suffix.lower() in PICTURE_SUFFIXES and re.search(r"[0-9]$", path.stem) for path in inside)
         if len(videos) == 1:
             clips[below.name] = videos[0]
         elif numbered and not videos:
