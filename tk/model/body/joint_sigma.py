@@ -22,7 +22,7 @@ Float = NDArray[np.float64]
 # Offset of a joint from the anatomical one, metres along an axis, and the error of the trunk and of what it carries if
 # the waist bends by one radian, metres; fitted to rendered people, so that as many errors lie within 1 and 2 σ as for a
 # normal distribution.
-OFFSET_M, BENT_M = 0.005, 0.02
+OFFSET_M, BENT_M = 0.005, 0.016
 
 # Standard deviation of the displacement of a segment's contours in one view by clothes and the model's shape, metres
 # along an axis: of the part that is the same in all frames of a recording, and of the part that changes, chosen on
