@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import h5py
@@ -21,7 +22,7 @@ from tests.conftest import QUICK, Tk, track
 from tests.made_results import write_motion
 from tk.batch import Job, Outcome, exit_code
 from tk.batch.jobs import BEGUN, DONE, FAILED, make_jobs
-from tk.batch.run import _finished
+from tk.batch.run import _finished, run_batch
 from tk.batch.summary import write_summary
 from tk.batch.work import _errors, work
 from tk.errors import CaptureError, ConfigError, ResultError
@@ -289,6 +290,17 @@ def test_failure_of_a_capture_has_the_hint(tmp_path: Path, monkeypatch: pytest.M
     (tmp_path / "jobs").mkdir()
     outcome = work(Job("rec", tmp_path / "rec", tmp_path, RecordingOptions()))
     assert outcome.failure == "rec: is a Pose2Sim project; tk import rec -o CAPTURE"
+
+
+def test_files_beside_the_captures_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    notes, given = [], []
+    table = tmp_path / "table.csv"
+    table.touch()
+    (tmp_path / "rec").mkdir()
+    reporter = SimpleNamespace(note=notes.append)
+    monkeypatch.setattr("tk.batch.run.make_jobs", lambda captures, *_: given.extend(captures) or [])
+    assert run_batch([table, tmp_path / "rec"], tmp_path / "out", RecordingOptions(), reporter) == {}
+    assert given == [tmp_path / "rec"] and str(table) in notes[0]
 
 
 # --- a real cluster ---------------------------------------------------------------------------------------------------

@@ -84,6 +84,11 @@ def run_batch(
         raise ConfigError(f"workers = {workers}: choose from 1 to 1000")
     described(options)  # fails early if the body cannot be read
     _require_dask(dashboard)
+    # a shell's recordings/* names notes and tables beside the captures, too
+    files = [path for path in captures if path.is_file()]
+    if files and len(files) < len(captures):
+        reporter.note(f"left out, because they are files, not captures: {', '.join(map(str, files))}")
+        captures = [path for path in captures if path not in files]
     with _locked(folder):
         jobs = make_jobs(captures, folder, options, pictures)
         outcomes = {job.name: job.read() for job in jobs}
