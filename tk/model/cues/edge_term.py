@@ -1,8 +1,11 @@
 """The edge term: the model's contours against the images' colour edges (Kehl 2006, section 6.1.2).
 
-The limbs' contour points (:mod:`tk.kernels.contour`), in the three views with the fewest hidden points, search edges
-along lines (:mod:`tk.kernels.edge_search`). The results are entries of the objective (:mod:`tk.kernels.alignment`),
-valid until they are assigned again. A hidden point, and a point without an edge, costs 1 and pulls nowhere.
+The limbs' contour points (:mod:`tk.kernels.contour`), in the three views that show most of them, search edges along
+lines (:mod:`tk.kernels.edge_search`). The results are entries of the objective (:mod:`tk.kernels.alignment`), valid
+until they are assigned again. A point that is hidden, outside the image or without an edge costs 1 and pulls nowhere.
+
+The paper takes the views with the fewest hidden points. Its cameras all see the whole person; a camera that looks away
+hides no point either.
 """
 
 from __future__ import annotations
@@ -92,11 +95,16 @@ class ContourTerm:
     def pairs(self, points: ContourPoints) -> tuple[NDArray[np.intp], Float32, Float32]:
         """Return the pose, the entry and the search line of each pair, single point and hidden half of a pair."""
         B, C = points.visible.shape[:2]
-        best = np.argsort(points.occluded, axis=1, kind="stable")[:, :VIEWS]
+        width_height = self.sizes[:, None, None, ::-1]
+        inside = ((points.pixels >= -0.5) & (points.pixels < width_height - 0.5)).all(axis=4)
+        shown = points.visible.astype(bool) & inside
+        count = shown.sum(axis=(2, 3))
+        best = np.argsort(-count, axis=1, kind="stable")[:, :VIEWS]
         used = np.zeros((B, C), bool)
         used[np.arange(B)[:, None], best] = True
+        used &= count > 0
         b, v, k = np.nonzero(points.found.any(axis=3) & used[:, :, None])
-        seen = points.visible[b, v, k].astype(bool)
+        seen = shown[b, v, k]
         both, any_seen = seen.all(axis=1), seen.any(axis=1)
         first = np.where(seen[:, 0], 0, 1)
         ends = [(b, v, k, first), (b, v, k, np.where(both, 1, first))]
