@@ -86,14 +86,15 @@ class ContourTerm:
     def assign(self, images: NDArray[np.uint8], poses: Float, chosen: Ints) -> Float32:
         """Return entries (B, E, 16) at poses (B, D) from strips (B, K) and images (C, H, W, 3)."""
         pose_of, entries, lines = self.pairs(self.kernel(poses, chosen))
+        wanted = np.flatnonzero(entries[:, alignment.STATE] == alignment.ASSIGNED)
         found = search_edges(images, self.sizes, lines, THRESHOLD)
-        wanted = entries[:, alignment.STATE] == alignment.ASSIGNED
-        entries[:, alignment.TARGET : alignment.TARGET + 2] = 0.5 * (found[:, 1:3] + found[:, 3:5])
-        entries[wanted & (found[:, 0] == 0), alignment.STATE] = alignment.UNASSIGNABLE
+        entries[wanted, alignment.TARGET : alignment.TARGET + 2] = 0.5 * (found[:, 1:3] + found[:, 3:5])
+        entries[wanted[found[:, 0] == 0], alignment.STATE] = alignment.UNASSIGNABLE
         return _by_pose(pose_of, entries, len(poses))
 
     def pairs(self, points: ContourPoints) -> tuple[NDArray[np.intp], Float32, Float32]:
-        """Return the pose, the entry and the search line of each pair, single point and hidden half of a pair."""
+        """Return the pose (E,) and the entry (E, 16) of each pair, single point and hidden half of a pair; and the
+        search lines (R, 11) of the entries that may have an edge, in the same order."""
         B, C = points.visible.shape[:2]
         width_height = self.sizes[:, None, None, ::-1]
         inside = ((points.pixels >= -0.5) & (points.pixels < width_height - 0.5)).all(axis=4)
@@ -134,7 +135,7 @@ class ContourTerm:
         concealed[:, a.STATE] = a.UNASSIGNABLE
         concealed[:, a.SCALE] = share[half]
         b, entries = np.concatenate([b, b[half]]), np.concatenate([entries, concealed])
-        return b, entries, np.concatenate([lines, lines[half]])
+        return b, entries, lines[any_seen]
 
 
 def _by_pose(pose_of: NDArray[np.intp], entries: Float32, poses: int) -> Float32:
