@@ -41,7 +41,7 @@ from tk.model.stateful import Stateful
 from tk.optim import schedule
 from tk.optim.smd import MAX_ITERATIONS
 from tk.settings import Settings
-from tk.trackers.contour_finder import ContourFinder
+from tk.trackers.contour_finder import ContourFinder, blind
 from tk.trackers.judgement import Match
 from tk.trackers.protocol import Estimate, Frame, Stopwatch
 from tk.trackers.reason import Reason, is_lost
@@ -133,7 +133,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
 
     def anticipate(self, frame: Frame, subject: Subject) -> None:
         """See :class:`~tk.trackers.protocol.Tracker`."""
-        self._finder.anticipate(_blind(frame), subject)
+        self._finder.anticipate(frame, subject)
 
     def start(self, frames: Sequence[Frame], subject: Subject) -> None:
         """Find the subject in the first frame and fit the body to all frames, see :meth:`ContourFinder.find`.
@@ -141,7 +141,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
         Raises:
             CaptureError: the volume is empty.
         """
-        pose = self._finder.find([_blind(frame) for frame in frames], subject)
+        pose = self._finder.find(frames, subject)
         first = frames[0]
         self.hull.update(first.masks)
         surface = self.hull.surface(first.images)
@@ -228,8 +228,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
         Not in the paper: a limb that was left behind finds other voxels near it and stays.
         """
         finder = self._finder
-        # without images: colours inside the silhouettes are a cue of the region tracker only
-        seen = finder.see(Frame(frame.index, frame.images[:0], frame.masks, frame.uncertain))
+        seen = finder.see(blind(frame))  # colours inside the silhouettes are a cue of the region tracker only
         converged = finder.settle(seen.pyramid, self._to_contours(found.pose)[None]).states[0]
         candidates, _ = finder.compared(seen, converged, *finder.proposed(seen, converged))
         starts = problem.constrain(np.array([self._from_contours(candidate) for candidate in candidates]))
@@ -327,8 +326,3 @@ class VolumetricTracker(Stateful[VolumetricState]):
         """Take the body of a run."""
         self._finder.take_body(restore_body(model))
         self._build()
-
-
-def _blind(frame: Frame) -> Frame:
-    """Return a frame without images: colours inside the silhouettes are a cue of the region tracker only."""
-    return Frame(frame.index, frame.images[:0], frame.masks)
