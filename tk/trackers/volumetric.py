@@ -153,7 +153,8 @@ class VolumetricTracker(Stateful[VolumetricState]):
         self._build()
         self._pose = self._previous = self._from_contours(pose)
         index = self._index(surface, np.full(len(surface), -1, np.int64))
-        fit = FrameObjective(self._objective, index, np.random.default_rng(0), images=first.images).fit(self._pose)
+        problem = FrameObjective(self._objective, index, np.random.default_rng(0), first.images, self.hull.used)
+        fit = problem.fit(self._pose)
         patch, colors = self._correspondences(surface, index, fit)
         self._appearance = Appearance.learn(len(self.skin.patch_names), patch, colors)
         self.hull.reset()
@@ -185,7 +186,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
         watch.lap("colour")
         # one generator per frame: a resumed run draws the same samples as an uninterrupted run
         rng = np.random.default_rng([settings.seed, frame.index])
-        problem = FrameObjective(self._objective, index, rng, images=frame.images)
+        problem = FrameObjective(self._objective, index, rng, frame.images, self.hull.used)
         # (2) all degrees of freedom at ε₁, (3) five chains at ε₂ (section 6.4)
         result = self.optimise(problem, self._starts(surface))
         every = self._finder.search_frames
@@ -281,7 +282,8 @@ class VolumetricTracker(Stateful[VolumetricState]):
         return float((np.bincount(chain, fit.unmatched) / np.maximum(np.bincount(chain), 1)).max())
 
     def _nothing_seen(self, frame: Frame, surface: HullSurface, watch: Stopwatch) -> Estimate:
-        """Return the last pose with status "lost": the volume is empty."""
+        """Return the last pose with status "lost": the volume is empty, because fewer than two cameras see anybody, or
+        because their masks exclude each other."""
         self._previous = self._pose
         self._lost_for += 1
         for stage in ("colour", "optimise", "update"):
@@ -290,7 +292,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
             pose=self._pose,
             joints=self.skin.skeleton.joints(self._pose),
             origin=Status.TRACKED,
-            found=Reason.NOBODY,
+            found=Reason.NOBODY if np.count_nonzero(self.hull.used) < 2 else Reason.UNEXPLAINED,
             objective=1.0 + self.settings.volumetric.coverage_weight,
             iterations=np.zeros(len(self.stages), np.int32),
             timing=watch.laps,

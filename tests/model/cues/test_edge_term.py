@@ -110,6 +110,13 @@ def test_no_edges_are_searched_in_views_that_do_not_show_the_person():
     assert views_used(term.pairs(points)[1]) == {0, 1}
 
 
+def test_no_edges_are_searched_in_views_that_are_left_out():
+    term = term_of()
+    points = term.kernel(TRUTH[None], strips_of(term)[None])
+    left = np.array([True, False, True, False])
+    assert views_used(term.pairs(points)[1]) - {0, 2} and views_used(term.pairs(points, left)[1]) == {0, 2}
+
+
 def test_points_outside_the_image_cost_and_pull_nowhere():
     narrow = Rig(tuple(replace(c, width=c.width // 2 + 10) for c in RIG))
     term = term_of(rig=narrow)

@@ -83,23 +83,29 @@ class ContourTerm:
         found[_LIMB_CHAINS] = (picked + CIRCLES * np.arange(len(LIMBS))[:, None]).reshape(len(_LIMB_CHAINS), -1)
         return found
 
-    def assign(self, images: NDArray[np.uint8], poses: Float, chosen: Ints) -> Float32:
-        """Return entries (B, E, 16) at poses (B, D) from strips (B, K) and images (C, H, W, 3)."""
-        pose_of, entries, lines = self.pairs(self.kernel(poses, chosen))
+    def assign(
+        self, images: NDArray[np.uint8], poses: Float, chosen: Ints, cameras: NDArray[np.bool_] | None = None
+    ) -> Float32:
+        """Return entries (B, E, 16) at poses (B, D) from strips (B, K) and images (C, H, W, 3) of some cameras (C,),
+        by default of all."""
+        pose_of, entries, lines = self.pairs(self.kernel(poses, chosen), cameras)
         wanted = np.flatnonzero(entries[:, alignment.STATE] == alignment.ASSIGNED)
         found = search_edges(images, self.sizes, lines, THRESHOLD)
         entries[wanted, alignment.TARGET : alignment.TARGET + 2] = 0.5 * (found[:, 1:3] + found[:, 3:5])
         entries[wanted[found[:, 0] == 0], alignment.STATE] = alignment.UNASSIGNABLE
         return _by_pose(pose_of, entries, len(poses))
 
-    def pairs(self, points: ContourPoints) -> tuple[NDArray[np.intp], Float32, Float32]:
+    def pairs(
+        self, points: ContourPoints, cameras: NDArray[np.bool_] | None = None
+    ) -> tuple[NDArray[np.intp], Float32, Float32]:
         """Return the pose (E,) and the entry (E, 16) of each pair, single point and hidden half of a pair; and the
-        search lines (R, 11) of the entries that may have an edge, in the same order."""
+        search lines (R, 11) of the entries that may have an edge, in the same order. ``cameras``: as for
+        :meth:`assign`."""
         B, C = points.visible.shape[:2]
         width_height = self.sizes[:, None, None, ::-1]
         inside = ((points.pixels >= -0.5) & (points.pixels < width_height - 0.5)).all(axis=4)
         shown = points.visible.astype(bool) & inside
-        count = shown.sum(axis=(2, 3))
+        count = shown.sum(axis=(2, 3)) * (1 if cameras is None else cameras)
         best = np.argsort(-count, axis=1, kind="stable")[:, :VIEWS]
         used = np.zeros((B, C), bool)
         used[np.arange(B)[:, None], best] = True

@@ -190,6 +190,7 @@ class FrameObjective:
         index: the frame's surface voxels.
         rng: random generator of the samples.
         images: (C, H, W, 3) for the edge term; None without that term.
+        cameras: (C,) bool, cameras that show the person, for the same; None: all.
 
     Attributes:
         even: (M,), (Q,), (K,) samples, voxels and strips, evenly spread.
@@ -201,8 +202,9 @@ class FrameObjective:
         index: SurfaceIndex,
         rng: np.random.Generator,
         images: NDArray[np.uint8] | None = None,
+        cameras: NDArray[np.bool_] | None = None,
     ) -> None:
-        self.objective, self.index, self.rng, self.images = objective, index, rng, images
+        self.objective, self.index, self.rng, self.images, self.cameras = objective, index, rng, images, cameras
         self.contours = None if images is None else objective.contours
         self.free = objective.chain_free
         self.angular = ~objective.body.skeleton.prismatic
@@ -326,4 +328,4 @@ class FrameObjective:
         """Return the entries (B, E, 16) of the edge term at poses (B, D) for strips (B, K); None without the term."""
         if self.contours is None or self.images is None:
             return None
-        return self.contours.assign(self.images, poses, strips)
+        return self.contours.assign(self.images, poses, strips, self.cameras)
