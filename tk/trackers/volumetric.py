@@ -98,7 +98,6 @@ class VolumetricTracker(Stateful[VolumetricState]):
     timing_stages: tuple[str, ...] = ("hull", "surface", "colour", "optimise", "update")
     objective_kind = "robust distance of surface points"
     image_step = 1
-    can_exclude_cameras = False
     reports_sigma = False
     has_segments = False
     has_second_pass = False
