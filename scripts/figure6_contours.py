@@ -134,7 +134,8 @@ def figure(body: SuperellipsoidBody, pose: Float, rig: Rig, images: Sequence[Ima
     for view, (camera, canvas) in enumerate(zip(rig, canvases, strict=False)):
         draw_pairs(canvas, pairs, view)
         draw_contours(canvas, strips, contours, view)
-        text = f"{camera.name}: {pairs.occluded[0, view]} of {pairs.found[0, view].sum()} contour points occluded"
+        hidden, count = np.sum(pairs.found[0, view] != pairs.visible[0, view]), pairs.found[0, view].sum()
+        text = f"{camera.name}: {hidden} of {count} contour points occluded"
         cv2.putText(canvas, text, (12, 28), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (255, 255, 255), 1, cv2.LINE_AA)
     draw_strips(canvases[-1], body, pose, rig[0])
     height = max(len(canvas) for canvas in canvases)

@@ -239,7 +239,7 @@ def test_a_batch_is_its_poses_one_by_one(kernel):
     assert np.array_equal(together.strip, chosen)
     for b in range(3):
         alone = kernel(poses[b : b + 1], chosen[b : b + 1])
-        for name in ("points_zero", "pixels", "normals", "found", "visible", "occluded"):
+        for name in ("points_zero", "pixels", "normals", "found", "visible"):
             assert np.array_equal(getattr(together, name)[b], getattr(alone, name)[0]), name
     assert not together.found[:, :, 0].any(), "-1 is no strip"
 
@@ -275,7 +275,6 @@ def test_points_behind_a_camera_are_zero():
     assert not points.found[0, 1].any() and not points.visible[0, 1].any()
     for name in ("points_zero", "pixels", "normals"):
         assert not getattr(points, name)[0, 1].any(), name
-    assert points.occluded[0, 1] == 0
 
 
 def test_no_strips_give_no_points_and_wrong_ones_are_named(kernel):

@@ -51,7 +51,7 @@ def blob(shape, seed, share=0.5):
     return np.random.default_rng(seed).random(shape) < share
 
 
-def shade(active, eyes, pixels=None, images=None, masks=None, spacing=1):
+def shade(active, eyes, pixels=None, images=None, masks=None, spacing=1, used=None):
     eyes = np.atleast_2d(np.asarray(eyes, dtype=np.float32))
     count = len(eyes)
     if pixels is None:
@@ -62,7 +62,8 @@ def shade(active, eyes, pixels=None, images=None, masks=None, spacing=1):
     occupied = pack_oracle(active)
     voxels, box = kernels.surface_voxels(occupied, active.shape, np.empty(active.size, dtype=np.int32))
     spacings = np.full(count, spacing, dtype=np.int32)
-    shaded = kernels.shade_surface(occupied, active.shape, pixels, eyes, spacings, images, masks, voxels, box)
+    used = np.ones(count, bool) if used is None else used
+    shaded = kernels.shade_surface(occupied, active.shape, pixels, used, eyes, spacings, images, masks, voxels, box)
     return voxels, *shaded
 
 
@@ -110,9 +111,11 @@ def test_carving_follows_any_sequence_of_masks(cameras, shape, pixel_count, seed
         masks = np.zeros((cameras, previous.shape[1] * 8), dtype=np.uint8)
         foreground = rng.random((cameras, pixel_count)) < share
         masks[:, :pixel_count] = foreground * rng.choice([1, 128, 255], foreground.shape)
+        carving = rng.random(cameras) < 0.8
         kernels.carve(
             row_offsets,
             entries,
+            carving,
             kernels.pack(enough.reshape(shape)),
             masks.view(np.int64),
             previous,
@@ -123,7 +126,8 @@ def test_carving_follows_any_sequence_of_masks(cameras, shape, pixel_count, seed
         for camera in range(cameras):
             both = kernels.unpack(planes[2 * camera] | planes[2 * camera + 1], shape)
             np.testing.assert_array_equal(both.ravel(), passed[camera])
-        np.testing.assert_array_equal(kernels.unpack(occupied, shape).ravel(), np.all(passed, axis=0) & enough)
+        expected = np.all(np.array(passed)[carving], axis=0) & enough
+        np.testing.assert_array_equal(kernels.unpack(occupied, shape).ravel(), expected)
         np.testing.assert_array_equal(previous, masks.view(np.int64))
 
 

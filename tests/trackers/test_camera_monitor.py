@@ -31,6 +31,7 @@ from tk.trackers.judgement import FAULTS, STATES
 from tk.trackers.protocol import Estimate, Frame
 from tk.trackers.reason import Reason, report_frames
 from tk.trackers.region import RegionTracker
+from tk.trackers.volumetric import VolumetricTracker
 
 CONFIG = settings_file.from_toml(FITTED)
 Spoil = Callable[[Frame], Frame]
@@ -396,10 +397,23 @@ def test_person_whose_size_contradicts_the_given_height_is_refused(scene: Scene)
         monitor.start(scene.frames[:3])
 
 
+def test_the_volumetric_tracker_goes_without_a_camera_that_shows_nothing(scene: Scene) -> None:
+    capture, body = scene.capture, scene.monitor().tracker.body
+    tracker = VolumetricTracker(capture.rig, capture.volume, capture.up, replace(CONFIG, voxels=48))
+    tracker.start(scene.frames[:1], Subject(capture.subject_height_m, body=body))
+    monitor = CameraMonitor(tracker, scene.setup, scene.setup.subjects[0])
+    images, masks = scene.frames[1].images.copy(), scene.frames[1].masks.copy()
+    images[3], masks[3] = 0, 255
+    monitor.step(scene.frames[0])
+    estimate, used = monitor.step(replace(scene.frames[1], images=images, masks=masks))
+    assert estimate.cameras is not None and np.flatnonzero(estimate.cameras).tolist() == [3]
+    assert not used.masks[3].any() and estimate.status == "tracked"
+
+
 class Jumping:
     """A tracker whose estimate jumps in one frame."""
 
-    can_exclude_cameras = tracks_among_others = has_second_pass = False
+    tracks_among_others = has_second_pass = False
 
     def __init__(self, joints: np.ndarray, when: int) -> None:
         self.joints, self.when = joints, when

@@ -153,7 +153,9 @@ masks_option = click.option(
 voxels_option = click.option("--voxels", type=int, help="Voxels along the longest side of the volume.  [default: 64]")
 no_report_option = click.option("--no-report", is_flag=True, help="Write no overlay video and no report.")
 config_option = click.option("--config", "config_file", type=PATH, help="Settings file (TOML).")
-preset_option = click.option("--preset", metavar="NAME", help="Settings to start from: kehl2006, the first paper's.")
+preset_option = click.option(
+    "--preset", metavar="NAME", help="Settings to start from: kehl2006, the volumetric tracker without its limb search."
+)
 resample_option = click.option(
     "--resample", is_flag=True, default=None, help="Choose images by time stamps: cameras of different rates."
 )

@@ -209,14 +209,6 @@ class ContourPoints:
     found: np.ndarray  # (B, C, K, 2) uint8, 1 where the strip crosses the rim in front of the camera
     visible: np.ndarray  # (B, C, K, 2) uint8, 1 where found and not hidden by another piece
 
-    @property
-    def occluded(self) -> np.ndarray:
-        """(B, C) number of contour points that are hidden: section 6.1.2 takes the three views with the fewest.
-
-        Where the paper is silent: a strip that a camera sees end-on has no contour and counts as neither.
-        """
-        return np.sum(self.found != self.visible, axis=(2, 3))
-
 
 @functools.lru_cache(8)
 def _scratch(tasks: int, degrees: int, pieces: int, dtype: np.dtype) -> tuple[np.ndarray, np.ndarray]:

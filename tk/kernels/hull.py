@@ -14,7 +14,7 @@ and applied eight pixels at a time.
     foreground or it lies outside the image. Two threads work on a camera, each on every other stretch of its pixels and
     each in its own row. So no memory is shared, no atomics are needed, and a plane stays in the processor's cache.
 ``occupied`` (W,) uint32
-    The active voxels: the bitwise and of all cameras. Surface and visibility read only this.
+    The active voxels: the bitwise and of all cameras that carve. Surface and visibility read only this.
 
 All values are integers: results are exact and do not depend on the order of the threads.
 """
@@ -131,6 +131,7 @@ def _carve_kernel(
     entries: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (L,)
     cameras: ti.i32,  # C
     spread: ti.i32,
+    carving: ti.types.ndarray(dtype=ti.u8, ndim=1),  # (C,)
     enough: ti.types.ndarray(dtype=ti.u32, ndim=1),  # (W,)
     current: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (C * M,) masks, eight pixels a word
     previous: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (C * M,) in and out
@@ -165,10 +166,11 @@ def _carve_kernel(
         active = enough[w]
         camera = 0
         while active != 0 and camera < cameras:
-            passed = ti.u32(0)
-            for share in ti.static(range(SHARES)):
-                passed |= planes[(camera * SHARES + share) * plane_words + w]
-            active &= passed
+            if carving[camera] != 0:
+                passed = ti.u32(0)
+                for share in ti.static(range(SHARES)):
+                    passed |= planes[(camera * SHARES + share) * plane_words + w]
+                active &= passed
             camera += 1
         occupied[w] = active
 
@@ -176,6 +178,7 @@ def _carve_kernel(
 def carve(
     row_offsets: NDArray[np.int32],
     entries: NDArray[np.int32],
+    carving: NDArray[np.bool_],
     enough: NDArray[np.uint32],
     current: NDArray[np.int64],
     previous: NDArray[np.int64],
@@ -190,6 +193,7 @@ def carve(
 
     Args:
         row_offsets, entries: the look-up lists of :func:`look_up_lists`.
+        carving: (C,) bool, the cameras that carve. The planes of the others follow their masks, too.
         enough: (W,) uint32, the voxels in enough images to be active.
         current, previous: (C, M) int64, each camera's mask (H * W,) uint8, zero-padded to whole words.
         planes: (2C, W) uint32.
@@ -198,7 +202,8 @@ def carve(
     ensure_runtime()
     cameras = len(current)
     flat = (current.reshape(-1), previous.reshape(-1), planes.reshape(-1))
-    _carve_kernel(row_offsets, entries, cameras, spread_of(cameras * SHARES), enough, *flat, occupied)
+    carves = carving.view(np.uint8)
+    _carve_kernel(row_offsets, entries, cameras, spread_of(cameras * SHARES), carves, enough, *flat, occupied)
 
 
 # --- surface -----------------------------------------------------------------------------------------------------
@@ -332,6 +337,7 @@ def _shade_kernel(
     occupied: ti.types.ndarray(dtype=ti.u32, ndim=3),  # (nx, ny, nw)
     nz: ti.i32,
     pixels: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (V, C)
+    used: ti.types.ndarray(dtype=ti.u8, ndim=1),  # (C,)
     eyes: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (C, 3) voxels
     spacing: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (C,) pixels
     images: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (C, H, W, 3), or (C, 0, 0, 3)
@@ -357,7 +363,7 @@ def _shade_kernel(
         cameras = 0
         for camera in range(pixels.shape[1]):
             pixel = pixels[voxel, camera]
-            if pixel >= 0:
+            if pixel >= 0 and used[camera] != 0:
                 view = (ti.Vector([eyes[camera, 0], eyes[camera, 1], eyes[camera, 2]]) - center).normalized()
                 cosine = normal.dot(view)
                 start = center + _LIFT * normal
@@ -389,6 +395,7 @@ def shade_surface(
     occupied: NDArray[np.uint32],
     shape: tuple[int, int, int],
     pixels: NDArray[np.int32],
+    used: NDArray[np.bool_],
     eyes: NDArray[np.float32],
     spacing: NDArray[np.int32],
     images: NDArray[np.uint8] | None,
@@ -406,6 +413,7 @@ def shade_surface(
         occupied: (W,) uint32.
         shape: (nx, ny, nz).
         pixels: (V, C) int32, pixel of each voxel in each camera, -1 outside the image.
+        used: (C,) bool, the cameras that may see a voxel.
         eyes: (C, 3) float32, centres of projection in voxels: the centre of voxel (0, 0, 0) is the origin.
         spacing: (C,) int32, pixels between the three by three samples of a voxel's colour.
         images: (C, H, W, 3) uint8, or None for no colours.
@@ -426,5 +434,6 @@ def shade_surface(
         if images is None:
             images = np.empty((len(masks), 0, 0, 3), dtype=np.uint8)
         packed = occupied.reshape(shape[0], shape[1], -1)
-        _shade_kernel(packed, shape[2], pixels, eyes, spacing, images, masks, voxels, box, normals, colors, seen)
+        given = pixels, used.view(np.uint8), eyes, spacing, images, masks, voxels, box
+        _shade_kernel(packed, shape[2], *given, normals, colors, seen)
     return normals, colors, seen

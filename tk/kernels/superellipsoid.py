@@ -73,8 +73,9 @@ def project(q, radii, e1, e2, z_lower, z_upper):
     g = implicit(c, radii, e1, e2)
     gradient = ti.Vector([g[1], g[2], g[3]])
     square = ti.max(gradient.norm_sqr(), 1e-9)
-    # Near the centre the gradient is unreliable: there the step is bounded by the piece's size. A point far outside
-    # takes the whole step; without a step it would count as lying on the surface.
+    # A point far outside takes the whole step; without a step it would count as lying on the surface. From inside, by
+    # homogeneity, no step is longer than √3 of the largest radius. Within about 0.1 mm of the centre powers and norms
+    # are at their floors, and the step may have any length: there none is taken.
     step = (g[0] - 1.0) / square
     s = c - step * gradient
     limit = 2.0 * ti.max(radii[0], ti.max(radii[1], radii[2]))

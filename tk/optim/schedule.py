@@ -1,9 +1,10 @@
 """The two passes of a frame (Kehl 2006, section 6.4): all degrees of freedom at ε₁, then the chains at ε₂ < ε₁ with the
 torso held, as one batch. They see the frame's objective as a :class:`Problem`.
 
-Beyond the paper, SMD works in directions that whiten the Gauss-Newton Hessian at the start of each pass. The paper's
-step sizes (2500 for most angles, 5000 for rolls, 10000 for knees and elbows) are a diagonal estimate of the inverse
-Hessian in its own units; here it follows from the data, so that a step of 1 is a Newton step.
+Beyond the paper, SMD works in directions that whiten the Gauss-Newton Hessian at the start of each pass: that of the
+whole body's objective, then that of each chain's own. The paper's step sizes (2500 for most angles, 5000 for rolls,
+10000 for knees and elbows) are a diagonal estimate of the inverse Hessian in its own units; here it follows from the
+data, so that a step of 1 is a Newton step.
 """
 
 from __future__ import annotations
@@ -63,7 +64,11 @@ class Problem(Protocol):
         ...
 
     def curvature(self, pose: Float) -> Float:
-        """Return the Gauss-Newton Hessian (D, D) at a pose."""
+        """Return the Gauss-Newton Hessian (D, D) of :meth:`full` at a pose."""
+        ...
+
+    def chain_curvatures(self, pose: Float) -> Float:
+        """Return the Gauss-Newton Hessians (K, D, D) of :meth:`chains` at a pose."""
         ...
 
     def damping(self, lever_m: float) -> Float:
@@ -90,10 +95,14 @@ def optimise(problem: Problem, starts: Float, max_iterations: int = smd.MAX_ITER
     tolerance = np.where(problem.angular, np.radians(TOLERANCE_DEG), TOLERANCE_M)
     max_step = np.where(problem.angular, np.radians(MAX_STEP_DEG), MAX_STEP_M)
 
-    def descend(objective: smd.Objective, pose: Float, free: NDArray[np.bool_]) -> smd.SmdResult:
-        """Optimise the free parameters (B, D) from a pose (D,), row by row."""
-        hessian, damping = problem.curvature(pose), problem.damping(LEVER_M)
-        basis, inverse = map(np.stack, zip(*(descent_basis(hessian, row, damping) for row in free), strict=True))
+    damping = problem.damping(LEVER_M)
+
+    def descend(
+        objective: smd.Objective, pose: Float, free: NDArray[np.bool_], hessians: Float, tolerance: Float
+    ) -> smd.SmdResult:
+        """Optimise the free parameters (B, D) from a pose (D,), row by row, with Hessians (B, D, D)."""
+        bases = [descent_basis(hessian, row, damping) for hessian, row in zip(hessians, free, strict=True)]
+        basis, inverse = map(np.stack, zip(*bases, strict=True))
         start = np.repeat(pose[None], len(free), axis=0)
         return smd.minimise(
             objective, start, RATE, tolerance, problem.constrain, (basis, inverse), max_step, max_iterations
@@ -101,10 +110,11 @@ def optimise(problem: Problem, starts: Float, max_iterations: int = smd.MAX_ITER
 
     starts = problem.constrain(starts)
     start = starts[0] if len(starts) == 1 else starts[int(np.argmin(problem.values(starts)))]
-    first = descend(problem.full(), start, np.ones((1, len(start)), bool))
+    every = np.ones((1, len(start)), bool)
+    first = descend(problem.full(), start, every, problem.curvature(start)[None], tolerance)
     pose = first.pose[0]
-    tolerance = REFINE * tolerance
-    chains = descend(problem.chains(np.arange(len(problem.free)), pose), pose, problem.free)
+    objective = problem.chains(np.arange(len(problem.free)), pose)
+    chains = descend(objective, pose, problem.free, problem.chain_curvatures(pose), REFINE * tolerance)
     result = pose.copy()
     for free, found in zip(problem.free, chains.pose, strict=True):
         result[free] = found[free]

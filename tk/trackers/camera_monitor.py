@@ -11,8 +11,6 @@ A camera is left out of a frame if
 
 No camera is left out for good. One that is wrong is weighed again in each frame in which it shows the person, if the
 images of three cameras can be used, and the tracker has residuals.
-
-Only contour trackers can go without a camera: a visual hull without one of its masks is empty.
 """
 
 from __future__ import annotations
@@ -169,11 +167,10 @@ class CameraMonitor(Stateful[MonitorState]):
             CaptureError: the cameras contradict each other, or the person's size contradicts the height in
                 `capture.toml`.
         """
-        excludes = self.tracker.can_exclude_cameras  # trackers of hulls need all cameras
-        bad = image_faults(self._setup.rig, frames) & excludes
+        bad = image_faults(self._setup.rig, frames)
         agreement = opening_agreement(self._setup, frames, bad)
         if whole and (agreement.refusal or np.count_nonzero(agreement.tested_right) < 2):
-            agreement = opening_agreement(self._setup, whole, image_faults(self._setup.rig, whole) & excludes)
+            agreement = opening_agreement(self._setup, whole, image_faults(self._setup.rig, whole))
         if agreement.refusal:
             raise CaptureError(agreement.refusal)
         if self._region is not None:
@@ -182,11 +179,6 @@ class CameraMonitor(Stateful[MonitorState]):
             self._cameras.accuse(camera)
             self._opening_reasons[camera] = agreement.reason(camera)
         out = self._cameras.states > 0
-        if out.any() and not self.tracker.can_exclude_cameras:
-            reasons = (
-                f"camera {self._names[c]} {FAULTS[WRONG]} ({reason})" for c, reason in self._opening_reasons.items()
-            )
-            raise CaptureError(f"{'; '.join(reasons)}: this method needs masks that fit from all cameras")
         alone = not any((f.masks == OTHERS).any() for f in frames)  # the hull of two people is larger than one
         if self._subject.height_m is not None and alone:
             check_extent(agreement.extent_m, self._subject.height_m)
@@ -210,8 +202,7 @@ class CameraMonitor(Stateful[MonitorState]):
         """Return the estimate for the next frame, and the observation without the excluded cameras."""
         cameras = self._cameras
         faults = self._health.look(frame.images, frame.masks, (cameras.states > 0) & ~cameras.unfit)
-        if self.tracker.can_exclude_cameras:
-            cameras.look(faults)
+        cameras.look(faults)
         out = cameras.states
         used = usable(frame, out > 0)
         if self._region is not None and np.count_nonzero(~cameras.unfit) >= 3:

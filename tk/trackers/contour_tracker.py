@@ -34,7 +34,6 @@ class ContourTracker(ContourFinder, Stateful[S], ABC):
 
     objective_kind = "E_S"
     image_step = 0
-    can_exclude_cameras = True
     reports_sigma = False
     has_segments = True
     has_second_pass = False

@@ -152,7 +152,6 @@ class Tracker(Protocol):
         objective_kind: meaning of ``Estimate.objective``.
         image_step: pixels of the cameras along an edge of a pixel of the images that it looks at, 1 or 2; 0: it looks
             at masks alone.
-        can_exclude_cameras: whether an empty mask excludes its camera. In a visual hull it would remove the subject.
         reports_sigma: whether estimates have sigma and residual.
         has_segments: whether segments, feet, joint angles and a smoothed copy are derived from its poses.
         has_second_pass: whether it goes over the frames a second time when all of them are known, as
@@ -170,7 +169,6 @@ class Tracker(Protocol):
     pose_units: tuple[str, ...]
     objective_kind: str
     image_step: int
-    can_exclude_cameras: bool
     reports_sigma: bool
     has_segments: bool
     has_second_pass: bool

@@ -41,7 +41,7 @@ from tk.model.stateful import Stateful
 from tk.optim import schedule
 from tk.optim.smd import MAX_ITERATIONS
 from tk.settings import Settings
-from tk.trackers.contour_finder import ContourFinder
+from tk.trackers.contour_finder import ContourFinder, blind
 from tk.trackers.judgement import Match
 from tk.trackers.protocol import Estimate, Frame, Stopwatch
 from tk.trackers.reason import Reason, is_lost
@@ -98,7 +98,6 @@ class VolumetricTracker(Stateful[VolumetricState]):
     timing_stages: tuple[str, ...] = ("hull", "surface", "colour", "optimise", "update")
     objective_kind = "robust distance of surface points"
     image_step = 1
-    can_exclude_cameras = False
     reports_sigma = False
     has_segments = False
     has_second_pass = False
@@ -133,7 +132,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
 
     def anticipate(self, frame: Frame, subject: Subject) -> None:
         """See :class:`~tk.trackers.protocol.Tracker`."""
-        self._finder.anticipate(_blind(frame), subject)
+        self._finder.anticipate(frame, subject)
 
     def start(self, frames: Sequence[Frame], subject: Subject) -> None:
         """Find the subject in the first frame and fit the body to all frames, see :meth:`ContourFinder.find`.
@@ -141,7 +140,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
         Raises:
             CaptureError: the volume is empty.
         """
-        pose = self._finder.find([_blind(frame) for frame in frames], subject)
+        pose = self._finder.find(frames, subject)
         first = frames[0]
         self.hull.update(first.masks)
         surface = self.hull.surface(first.images)
@@ -153,7 +152,8 @@ class VolumetricTracker(Stateful[VolumetricState]):
         self._build()
         self._pose = self._previous = self._from_contours(pose)
         index = self._index(surface, np.full(len(surface), -1, np.int64))
-        fit = FrameObjective(self._objective, index, np.random.default_rng(0), images=first.images).fit(self._pose)
+        problem = FrameObjective(self._objective, index, np.random.default_rng(0), first.images, self.hull.used)
+        fit = problem.fit(self._pose)
         patch, colors = self._correspondences(surface, index, fit)
         self._appearance = Appearance.learn(len(self.skin.patch_names), patch, colors)
         self.hull.reset()
@@ -185,7 +185,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
         watch.lap("colour")
         # one generator per frame: a resumed run draws the same samples as an uninterrupted run
         rng = np.random.default_rng([settings.seed, frame.index])
-        problem = FrameObjective(self._objective, index, rng, images=frame.images)
+        problem = FrameObjective(self._objective, index, rng, frame.images, self.hull.used)
         # (2) all degrees of freedom at ε₁, (3) five chains at ε₂ (section 6.4)
         result = self.optimise(problem, self._starts(surface))
         every = self._finder.search_frames
@@ -228,8 +228,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
         Not in the paper: a limb that was left behind finds other voxels near it and stays.
         """
         finder = self._finder
-        # without images: colours inside the silhouettes are a cue of the region tracker only
-        seen = finder.see(Frame(frame.index, frame.images[:0], frame.masks, frame.uncertain))
+        seen = finder.see(blind(frame))  # colours inside the silhouettes are a cue of the region tracker only
         converged = finder.settle(seen.pyramid, self._to_contours(found.pose)[None]).states[0]
         candidates, _ = finder.compared(seen, converged, *finder.proposed(seen, converged))
         starts = problem.constrain(np.array([self._from_contours(candidate) for candidate in candidates]))
@@ -282,7 +281,8 @@ class VolumetricTracker(Stateful[VolumetricState]):
         return float((np.bincount(chain, fit.unmatched) / np.maximum(np.bincount(chain), 1)).max())
 
     def _nothing_seen(self, frame: Frame, surface: HullSurface, watch: Stopwatch) -> Estimate:
-        """Return the last pose with status "lost": the volume is empty."""
+        """Return the last pose with status "lost": the volume is empty, because fewer than two cameras see anybody, or
+        because their masks exclude each other."""
         self._previous = self._pose
         self._lost_for += 1
         for stage in ("colour", "optimise", "update"):
@@ -291,7 +291,7 @@ class VolumetricTracker(Stateful[VolumetricState]):
             pose=self._pose,
             joints=self.skin.skeleton.joints(self._pose),
             origin=Status.TRACKED,
-            found=Reason.NOBODY,
+            found=Reason.NOBODY if np.count_nonzero(self.hull.used) < 2 else Reason.UNEXPLAINED,
             objective=1.0 + self.settings.volumetric.coverage_weight,
             iterations=np.zeros(len(self.stages), np.int32),
             timing=watch.laps,
@@ -327,8 +327,3 @@ class VolumetricTracker(Stateful[VolumetricState]):
         """Take the body of a run."""
         self._finder.take_body(restore_body(model))
         self._build()
-
-
-def _blind(frame: Frame) -> Frame:
-    """Return a frame without images: colours inside the silhouettes are a cue of the region tracker only."""
-    return Frame(frame.index, frame.images[:0], frame.masks)

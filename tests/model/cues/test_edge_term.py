@@ -1,6 +1,7 @@
 """The contour cues of a body: which points, views and weights; and that the truth explains its own pictures."""
 
 import functools
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -69,19 +70,63 @@ def assigned(term, poses, chosen=None):
     return term.assign(pictures(), poses, chosen), term.kernel(poses, chosen)
 
 
-def test_colour_edges_are_searched_in_the_views_with_the_fewest_hidden_points():
+def views_used(entries):
+    """The views of a pose's entries (E, 16)."""
+    return {int(c) for c in entries[entries[:, a.STATE] != a.ABSENT, a.CAMERA]}
+
+
+def inside_image(points, rig=RIG):
+    """(B, C, K, 2) bool, which contour points lie in the images."""
+    sizes = np.array([(camera.width, camera.height) for camera in rig])[:, None, None]
+    return ((points.pixels > -0.5) & (points.pixels < sizes - 0.5)).all(axis=-1)
+
+
+def test_colour_edges_are_searched_in_the_views_that_show_most_points():
     poses = some_poses(6, seed=22)
     term = term_of()
     entries, points = assigned(term, poses)
-    hidden = np.sum(points.found != points.visible, axis=(2, 3))
-    fewer = False
+    shown = np.sum(points.visible & inside_image(points), axis=(2, 3))
+    more = False
     for b in range(len(poses)):
-        used = {int(c) for c in entries[b, entries[b, :, a.STATE] != a.ABSENT, a.CAMERA]}
+        used = views_used(entries[b])
         assert len(used) == VIEWS
         rest = set(range(len(RIG))) - used
-        assert max(hidden[b, list(used)]) <= min(hidden[b, list(rest)])
-        fewer |= max(hidden[b, list(used)]) < min(hidden[b, list(rest)])
-    assert fewer, "all views were alike: nothing was tested"
+        assert min(shown[b, list(used)]) >= max(shown[b, list(rest)])
+        more |= min(shown[b, list(used)]) > max(shown[b, list(rest)])
+    assert more, "all views were alike: nothing was tested"
+
+
+def test_no_edges_are_searched_in_views_that_do_not_show_the_person():
+    """A camera that looks the other way hides no point, nor does one whose image ends beside the person."""
+    back, sideways = np.diag([-1.0, 1, -1]), np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    cameras = [*RIG][:2]
+    for turn in (back, sideways, cv2.Rodrigues(np.array([0.0, np.radians(50), 0]))[0]):
+        c = RIG[0]
+        cameras.append(replace(c, rotation=turn @ c.rotation, translation=turn @ c.translation))
+    rig = Rig(tuple(cameras))
+    term = term_of(rig=rig)
+    points = term.kernel(TRUTH[None], strips_of(term)[None])
+    assert points.visible[0, 4].any() and not (points.visible & inside_image(points, rig))[0, 2:].any()
+    assert views_used(term.pairs(points)[1]) == {0, 1}
+
+
+def test_no_edges_are_searched_in_views_that_are_left_out():
+    term = term_of()
+    points = term.kernel(TRUTH[None], strips_of(term)[None])
+    left = np.array([True, False, True, False])
+    assert views_used(term.pairs(points)[1]) - {0, 2} and views_used(term.pairs(points, left)[1]) == {0, 2}
+
+
+def test_points_outside_the_image_cost_and_pull_nowhere():
+    narrow = Rig(tuple(replace(c, width=c.width // 2 + 10) for c in RIG))
+    term = term_of(rig=narrow)
+    points = term.kernel(TRUTH[None], strips_of(term)[None])
+    outside = points.visible.astype(bool) & ~inside_image(points, narrow)
+    assert outside.any()
+    _, entries, lines = term.pairs(points)
+    assert len(lines) == np.sum(entries[:, a.STATE] == a.ASSIGNED) < len(entries)  # hidden points have no line
+    width = np.array([c.width for c in narrow])[lines[:, 1].astype(int)]
+    assert (lines[:, [2, 4]] < width[:, None] - 0.5).all()
 
 
 def test_limbs_only_have_edges():
@@ -103,7 +148,8 @@ def test_hidden_points_cost_and_pull_nowhere():
     for b in range(len(poses)):
         rows = entries[b][entries[b, :, a.STATE] != a.ABSENT]
         used = sorted({int(c) for c in rows[:, a.CAMERA]})
-        both_hidden = (points.found[b].any(axis=2) & ~points.visible[b].any(axis=2))[used].sum()
+        shown = points.visible[b].astype(bool) & inside_image(points)[b]
+        both_hidden = (points.found[b].any(axis=2) & ~shown.any(axis=2))[used].sum()
         lost += both_hidden
         per_pair = rows[:, a.SCALE].max()
         assert rows[rows[:, a.STATE] == a.UNASSIGNABLE][:, a.SCALE].sum() >= per_pair * both_hidden - 1e-6

@@ -162,6 +162,21 @@ def test_rows_of_a_chain_share_its_samples(frame, truth):
     assert not np.array_equal(result.gradient[0], result.gradient[1])
 
 
+@pytest.mark.parametrize("coverage", [BOTH, SURFACE])
+def test_curvature_of_a_chain_is_that_of_its_own_objective(index, truth, coverage):
+    """The mean over draws of its Gauss-Newton products. A chain is a fraction of the whole body's mean."""
+    frame = FrameObjective(BodyObjective(BODY, coverage), index, np.random.default_rng(0))
+    hessians = frame.chain_curvatures(truth)
+    for c in ALL_CHAINS:
+        free = np.flatnonzero(frame.free[c])
+        evaluate = frame.chains(np.full(len(free), c), truth)
+        rows = np.repeat(truth[None], len(free), 0), np.eye(D)[free]
+        drawn = np.mean([evaluate(*rows, i).hessian_vector[:, free] for i in range(30)], axis=0)
+        damping = np.diag(frame.damping(0.045)[free])
+        ratio = np.linalg.eigvals(np.linalg.solve(hessians[c][np.ix_(free, free)] + damping, drawn + damping)).real
+        assert 0.6 < ratio.min() <= ratio.max() < 1.6, (CHAIN_NAMES[c], ratio)
+
+
 def test_every_chain_may_cover_the_voxels_that_the_body_does_not_explain(frame, truth):
     pose = truth.copy()
     pose[SKELETON.index("hip_l_pitch")] -= np.radians(80)
@@ -201,6 +216,7 @@ def test_a_frame_of_one_voxel(objective, truth):
     index = SurfaceIndex.build(truth[None, :3], np.full(1, -1), 0.06)
     frame = FrameObjective(objective, index, np.random.default_rng(0))
     assert np.isfinite(frame.value(truth)) and np.isfinite(frame.curvature(truth)).all()
+    assert np.isfinite(frame.chain_curvatures(truth)).all()
     result = frame.chains(ALL_CHAINS, truth)(np.repeat(truth[None], 5, 0), np.zeros((5, D)), 0)
     assert np.isfinite(result.value).all()
 

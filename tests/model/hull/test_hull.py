@@ -39,11 +39,13 @@ def make_rig(count=4):
 
 
 def hull_oracle(rig, grid, masks):
-    """Project every voxel into every picture: active if foreground in all that hold it, and two do."""
+    """Project every voxel into every picture with foreground: active if foreground in all that hold it, and two do."""
     passed = np.ones(grid.count, dtype=bool)
     holders = np.zeros(grid.count, dtype=int)
     centers = grid.centers()
     for camera, mask in zip(rig, masks, strict=True):
+        if not mask.any():
+            continue
         inside = camera.sees(centers)
         xy = np.floor(camera.project(centers)[0][inside] + 0.5).astype(int)
         passed[inside] &= mask[xy[:, 1], xy[:, 0]] != 0
@@ -143,6 +145,22 @@ def test_voxels_outside_a_picture_are_not_carved_by_it_and_need_two_others():
     hull.carve(np.full((3, 40, 48), 255, dtype=np.uint8))
     np.testing.assert_array_equal(hull.occupancy, held >= 2)
     assert hull.occupancy.sum() > both.sum()
+
+
+def test_a_camera_without_foreground_neither_carves_nor_sees():
+    """As if it were not in the rig, while it is empty; with one camera left there is no depth, and no hull."""
+    rig, grid = make_rig(5), VoxelGrid.cover(VOLUME, 20)
+    hull, masks = VisualHull(rig, grid), silhouettes(rig, ball())
+    images = np.full((*masks.shape, 3), 90, np.uint8)
+    for empty in ((), (4,), (3, 4), (), (0, 2, 3), (0, 1, 2, 3), (2,)):
+        shown = masks.copy()
+        shown[list(empty)] = 0
+        hull.update(shown)
+        np.testing.assert_array_equal(hull.occupancy, hull_oracle(rig, grid, shown))
+        assert hull.occupancy.any() == (len(empty) < 4)
+        surface = hull.surface(images)
+        assert not any((surface.seen & 1 << c).any() for c in empty)
+        np.testing.assert_allclose(surface.colors[surface.seen != 0], 90, rtol=1e-5)
 
 
 def test_surface_of_a_two_coloured_ball():

@@ -1,8 +1,11 @@
 """The edge term: the model's contours against the images' colour edges (Kehl 2006, section 6.1.2).
 
-The limbs' contour points (:mod:`tk.kernels.contour`), in the three views with the fewest hidden points, search edges
-along lines (:mod:`tk.kernels.edge_search`). The results are entries of the objective (:mod:`tk.kernels.alignment`),
-valid until they are assigned again. A hidden point, and a point without an edge, costs 1 and pulls nowhere.
+The limbs' contour points (:mod:`tk.kernels.contour`), in the three views that show most of them, search edges along
+lines (:mod:`tk.kernels.edge_search`). The results are entries of the objective (:mod:`tk.kernels.alignment`), valid
+until they are assigned again. A point that is hidden, outside the image or without an edge costs 1 and pulls nowhere.
+
+The paper takes the views with the fewest hidden points. Its cameras all see the whole person; a camera that looks away
+hides no point either.
 """
 
 from __future__ import annotations
@@ -80,23 +83,35 @@ class ContourTerm:
         found[_LIMB_CHAINS] = (picked + CIRCLES * np.arange(len(LIMBS))[:, None]).reshape(len(_LIMB_CHAINS), -1)
         return found
 
-    def assign(self, images: NDArray[np.uint8], poses: Float, chosen: Ints) -> Float32:
-        """Return entries (B, E, 16) at poses (B, D) from strips (B, K) and images (C, H, W, 3)."""
-        pose_of, entries, lines = self.pairs(self.kernel(poses, chosen))
+    def assign(
+        self, images: NDArray[np.uint8], poses: Float, chosen: Ints, cameras: NDArray[np.bool_] | None = None
+    ) -> Float32:
+        """Return entries (B, E, 16) at poses (B, D) from strips (B, K) and images (C, H, W, 3) of some cameras (C,),
+        by default of all."""
+        pose_of, entries, lines = self.pairs(self.kernel(poses, chosen), cameras)
+        wanted = np.flatnonzero(entries[:, alignment.STATE] == alignment.ASSIGNED)
         found = search_edges(images, self.sizes, lines, THRESHOLD)
-        wanted = entries[:, alignment.STATE] == alignment.ASSIGNED
-        entries[:, alignment.TARGET : alignment.TARGET + 2] = 0.5 * (found[:, 1:3] + found[:, 3:5])
-        entries[wanted & (found[:, 0] == 0), alignment.STATE] = alignment.UNASSIGNABLE
+        entries[wanted, alignment.TARGET : alignment.TARGET + 2] = 0.5 * (found[:, 1:3] + found[:, 3:5])
+        entries[wanted[found[:, 0] == 0], alignment.STATE] = alignment.UNASSIGNABLE
         return _by_pose(pose_of, entries, len(poses))
 
-    def pairs(self, points: ContourPoints) -> tuple[NDArray[np.intp], Float32, Float32]:
-        """Return the pose, the entry and the search line of each pair, single point and hidden half of a pair."""
+    def pairs(
+        self, points: ContourPoints, cameras: NDArray[np.bool_] | None = None
+    ) -> tuple[NDArray[np.intp], Float32, Float32]:
+        """Return the pose (E,) and the entry (E, 16) of each pair, single point and hidden half of a pair; and the
+        search lines (R, 11) of the entries that may have an edge, in the same order. ``cameras``: as for
+        :meth:`assign`."""
         B, C = points.visible.shape[:2]
-        best = np.argsort(points.occluded, axis=1, kind="stable")[:, :VIEWS]
+        width_height = self.sizes[:, None, None, ::-1]
+        inside = ((points.pixels >= -0.5) & (points.pixels < width_height - 0.5)).all(axis=4)
+        shown = points.visible.astype(bool) & inside
+        count = shown.sum(axis=(2, 3)) * (1 if cameras is None else cameras)
+        best = np.argsort(-count, axis=1, kind="stable")[:, :VIEWS]
         used = np.zeros((B, C), bool)
         used[np.arange(B)[:, None], best] = True
+        used &= count > 0
         b, v, k = np.nonzero(points.found.any(axis=3) & used[:, :, None])
-        seen = points.visible[b, v, k].astype(bool)
+        seen = shown[b, v, k]
         both, any_seen = seen.all(axis=1), seen.any(axis=1)
         first = np.where(seen[:, 0], 0, 1)
         ends = [(b, v, k, first), (b, v, k, np.where(both, 1, first))]
@@ -126,7 +141,7 @@ class ContourTerm:
         concealed[:, a.STATE] = a.UNASSIGNABLE
         concealed[:, a.SCALE] = share[half]
         b, entries = np.concatenate([b, b[half]]), np.concatenate([entries, concealed])
-        return b, entries, np.concatenate([lines, lines[half]])
+        return b, entries, lines[any_seen]
 
 
 def _by_pose(pose_of: NDArray[np.intp], entries: Float32, poses: int) -> Float32:

@@ -190,6 +190,7 @@ class FrameObjective:
         index: the frame's surface voxels.
         rng: random generator of the samples.
         images: (C, H, W, 3) for the edge term; None without that term.
+        cameras: (C,) bool, cameras that show the person, for the same; None: all.
 
     Attributes:
         even: (M,), (Q,), (K,) samples, voxels and strips, evenly spread.
@@ -201,8 +202,9 @@ class FrameObjective:
         index: SurfaceIndex,
         rng: np.random.Generator,
         images: NDArray[np.uint8] | None = None,
+        cameras: NDArray[np.bool_] | None = None,
     ) -> None:
-        self.objective, self.index, self.rng, self.images = objective, index, rng, images
+        self.objective, self.index, self.rng, self.images, self.cameras = objective, index, rng, images, cameras
         self.contours = None if images is None else objective.contours
         self.free = objective.chain_free
         self.angular = ~objective.body.skeleton.prismatic
@@ -272,15 +274,36 @@ class FrameObjective:
         """Return the Gauss-Newton Hessian (D, D) at ``pose`` (D,), outliers weighing at least :data:`OUTLIERS`."""
         return self.fit(pose).linear.hessian
 
+    def chain_curvatures(self, pose: Float) -> Float:
+        """Return the Gauss-Newton Hessian (chains, D, D) of each chain's objective at ``pose`` (D,): that of the mean
+        over the chain's own samples, voxels and strips. Assignments are those of :meth:`fit`."""
+        body, held, (samples, voxels, _) = self.objective, self.fit(pose).held, self.even
+        covers = body.settings.coverage_weight > 0
+        chain = CHAIN_OF_SEGMENT[body.body.segment[samples]]
+        entries = self.edge_entries(np.repeat(pose[None], len(CHAINS), 0), self._strips(None))
+        hessians = []
+        for c, pool in enumerate(self._pools(pose)):
+            own = np.flatnonzero(chain == c)
+            edges = None if entries is None else entries[c : c + 1]
+            part = Held(held.assigned[:, own], held.covering[:, pool] if covers else held.covering)
+            points = samples[own], voxels[pool]
+            found = body.kernel.linearise(self.index, *points, pose, part, body.settings, OUTLIERS, entries=edges)
+            hessians.append(found.hessian)
+        return np.stack(hessians)
+
     def chain_voxels(self, pose: Float) -> list[Ints]:
         """Return the voxels that each chain may have to cover at ``pose``: the nearest to it or to no piece."""
-        fit, voxels = self.fit(pose), self.even[1]
+        return [self.even[1][pool] for pool in self._pools(pose)]
+
+    def _pools(self, pose: Float) -> list[NDArray[np.intp]]:
+        """Return the places of :meth:`chain_voxels` among the evenly spread voxels."""
+        fit, every = self.fit(pose), np.arange(len(self.even[1]))
         if self.objective.settings.coverage_weight <= 0:
-            return [voxels] * len(CHAINS)
+            return [every] * len(CHAINS)
         piece = fit.held.covering[0, :, 0].astype(np.int64)
         nearest = np.where(piece >= 0, self.objective.piece_chain[piece], -1)
-        pools = [voxels[(nearest == c) | fit.beyond(NEAR_M)] for c in range(len(CHAINS))]
-        return [pool if len(pool) else voxels for pool in pools]
+        pools = [np.flatnonzero((nearest == c) | fit.beyond(NEAR_M)) for c in range(len(CHAINS))]
+        return [pool if len(pool) else every for pool in pools]
 
     def draw_all(self) -> tuple[Ints, Ints, Ints]:
         """Draw at random: samples (M,) on the whole body, surface voxels (Q,) and strips (K,)."""
@@ -305,4 +328,4 @@ class FrameObjective:
         """Return the entries (B, E, 16) of the edge term at poses (B, D) for strips (B, K); None without the term."""
         if self.contours is None or self.images is None:
             return None
-        return self.contours.assign(self.images, poses, strips)
+        return self.contours.assign(self.images, poses, strips, self.cameras)

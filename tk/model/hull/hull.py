@@ -33,12 +33,16 @@ class HullSurface:
 class VisualHull:
     """A voxel grid carved by silhouettes. It keeps its state: a frame costs only the pixels that changed.
 
-    A voxel is active if its centre projects into at least two images, and to foreground in each of them. (The paper is
-    silent about voxels outside an image: its cameras all see the whole volume.)
+    A voxel is active if its centre projects into at least two images, and to foreground in each of them. A camera
+    without foreground does not carve, nor does it see a voxel: it counts as if the volume lay outside its image. (The
+    paper is silent about both: its cameras all see the person and the whole volume.)
 
     Args:
         rig: up to 31 cameras.
         grid: the voxels.
+
+    Attributes:
+        used: (C,) bool, the cameras with foreground.
 
     Raises:
         VolumeError: no voxel is seen by two cameras.
@@ -55,6 +59,7 @@ class VisualHull:
         self._planes = self._tables.empty_planes.copy()
         self._occupied = np.zeros(self._planes.shape[1], dtype=np.uint32)
         self._previous = np.zeros((len(rig), mask_words(rig)), dtype=np.int64)
+        self.used: NDArray[np.bool_] = np.zeros(len(rig), np.bool_)
         self._found = np.empty(grid.count, dtype=np.int32)
         self._clean = True
 
@@ -64,6 +69,7 @@ class VisualHull:
             self._planes[:] = self._tables.empty_planes
             self._occupied.fill(0)
             self._previous.fill(0)
+            self.used = np.zeros_like(self.used)
             self._clean = True
 
     def carve(self, masks: NDArray[np.uint8]) -> None:
@@ -77,13 +83,15 @@ class VisualHull:
         Args:
             masks: (C, H, W) uint8 with (H, W) = ``rig.frame_shape``, foreground where not 0.
         """
-        tables = self._tables
+        tables, words = self._tables, self._as_words(masks)
         self._clean = False
+        self.used = np.asarray(words.any(axis=1))
         kernels.carve(
             tables.row_offsets,
             tables.entries,
-            tables.enough,
-            self._as_words(masks),
+            self.used,
+            tables.enough_in(self.used),
+            words,
             self._previous,
             self._planes,
             self._occupied,
@@ -108,6 +116,7 @@ class VisualHull:
             self._occupied,
             self.grid.shape,
             self._tables.pixels,
+            self.used,
             self._eyes,
             self._spacing,
             None if images is None else np.ascontiguousarray(images),

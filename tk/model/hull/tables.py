@@ -34,6 +34,16 @@ class HullTables:
     empty_planes: NDArray[np.uint32]
     enough: NDArray[np.uint32]  # (W,) uint32, the voxels in at least two images
 
+    def enough_in(self, cameras: NDArray[np.bool_]) -> NDArray[np.uint32]:
+        """Return (W,) the voxels in at least two images of some cameras (C,)."""
+        if cameras.all():
+            return self.enough
+        once, twice = np.zeros_like(self.enough), np.zeros_like(self.enough)
+        for inside in ~self.empty_planes[:: kernels.SHARES][cameras]:
+            twice |= once & inside
+            once |= inside
+        return twice & self.enough
+
 
 def build_tables(rig: Rig, grid: VoxelGrid) -> HullTables:
     """Build the tables of this rig and grid.
