@@ -109,7 +109,7 @@ class BlazePose:
         # five in the image: x, y, z, visibility, presence (MediaPipe's tensors_to_pose_landmarks).
         present, world, points = (array[0] for array in sorted(found, key=np.size)[:3])
         x, y, _, visible, _ = points.reshape(-1, 5)[_USED].T.astype(np.float64)
-        pixels = np.stack([x, y], axis=1) / scale - 0.5  # the network counts from the corner of its image
+        pixels = (np.stack([x, y], axis=1) + 0.5) / scale - 0.5
         depth = world.reshape(-1, 3)[_USED, 2].astype(np.float64)
         landmarks = np.column_stack([pixels, _probability(visible) * present, depth])
         if not present >= _LEAST_PRESENT:
