@@ -124,17 +124,16 @@ class LandmarkCue:
         body: the person's body.
         seen: (V, L, 4) or (F, V, L, 4), x, y, pixels, visibility, and depth, metres behind the middle of the hips; NaN
             if unknown. Of F frames: as many as poses.
-        error_size: the landmarks' errors are those of a person so large as a multiple of the average one; None: of the
-            body's size.
+        size: of the person whom the network sees, relative to the average person: its depths and errors are
+            proportional to it; None: of the body.
     """
 
     weight = WEIGHT
 
-    def __init__(self, rig: Rig, body: ConeBody, seen: Float, error_size: float | None = None) -> None:
+    def __init__(self, rig: Rig, body: ConeBody, seen: Float, size: float | None = None) -> None:
         self._rig, self.body, self._seen = rig, body, seen
         self._elsewhere, self._precision = ELSEWHERE, 1.0
-        actual = body.dimensions.stature / AVERAGE_STATURE_M
-        self._size = size = error_size or actual
+        self._size = size = size or body.dimensions.stature / AVERAGE_STATURE_M
         frames = seen.reshape(-1, *seen.shape[-3:])  # (F, V, L, 4)
         known = known_landmarks(frames)
         at = np.where(known[..., None], _normalised(rig, frames)[..., :2], 0.0)
@@ -151,7 +150,7 @@ class LandmarkCue:
             _HALF,
             _cameras(rig, at, visibility),
             np.stack([marks, marks[..., _PARTNER, :]], axis=2),
-            _depths(np.where(known, frames[..., 3], np.nan), visibility, actual, size),
+            _depths(np.where(known, frames[..., 3], np.nan), visibility, size),
             np.concatenate([offset, _SHARE**2 * (offset[:, _FROM] + offset[:, _TO])], axis=1),
         )
         self._arrays = LandmarkArrays._make(map(np.ascontiguousarray, values))
@@ -232,13 +231,13 @@ def _cameras(rig: Rig, at: Float, visibility: Float) -> Float:
     return np.concatenate([np.broadcast_to(world, (*sight.shape[:2], 12)), sight], axis=2)
 
 
-def _depths(depth: Float, visibility: Float, size: float, error_size: float) -> Float:
+def _depths(depth: Float, visibility: Float, size: float) -> Float:
     """Return (F, V, 2, K, 3) depths of the bones, metres, probability of being right, and 1/variance, 1/m², as named,
-    and with left and right exchanged, from depth and visibility (F, V, L) of the landmarks of an average person."""
+    and with left and right exchanged, from depth and visibility (F, V, L) of the landmarks."""
     depth, visibility = (np.stack([v, v[..., _PARTNER]], axis=2) for v in (depth, visibility))
     seen = size * (depth[..., _TO] - depth[..., _FROM])
     known, visibility = np.isfinite(seen), np.minimum(visibility[..., _TO], visibility[..., _FROM])
-    sigma = DEPTH_M * error_size * DEPTH_HIDDEN ** (1.0 - visibility)
+    sigma = DEPTH_M * size * DEPTH_HIDDEN ** (1.0 - visibility)
     return np.stack([np.where(known, seen, 0.0), np.where(known, right_share(visibility), 0.0), sigma**-2], axis=-1)
 
 
@@ -331,8 +330,8 @@ def stature(rig: Rig, seen: Float) -> float | None:
 
     def explained(log_stature: float, rest: Float | None = None) -> tuple[float, Float]:
         body = build_cone_body(BodyDimensions.from_stature(float(np.exp(log_stature))))
-        # the errors are those of a person of average stature: else smaller ones would make small bodies likelier
-        cue = LandmarkCue(rig, body, seen, error_size=1.0)
+        # of one size throughout: else the smaller errors and depths of small bodies would make them likelier
+        cue = LandmarkCue(rig, body, seen, size=1.0)
         poses, cost = _descended(cue, resting_figures(body.skeleton, p_near) if rest is None else rest)
         return float(cost.min()), poses[np.argsort(cost, kind="stable")[:2]]
 
