@@ -25,7 +25,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from tk.kernels.cone_arrays import NEAREST_M
 from tk.kernels.landmark_terms import LandmarkArrays, landmark_costs, landmark_information
@@ -335,12 +334,17 @@ def stature(rig: Rig, seen: Float) -> float | None:
         poses, cost = _descended(cue, resting_figures(body.skeleton, p_near) if rest is None else rest)
         return float(cost.min()), poses[np.argsort(cost, kind="stable")[:2]]
 
-    sizes = np.linspace(np.log(LEAST_STATURE), np.log(GREATEST_STATURE), STATURES)
-    costs, poses = zip(*map(explained, sizes), strict=True)
+    coarse = np.linspace(np.log(LEAST_STATURE), np.log(GREATEST_STATURE), STATURES)
+    costs, poses = zip(*map(explained, coarse), strict=True)
     best = int(np.argmin(costs))
-    bounds = sizes[max(best - 1, 0)], sizes[min(best + 1, len(sizes) - 1)]
-    nearest = minimize_scalar(lambda at: explained(at, poses[best])[0], bounds=bounds, options={"xatol": 0.01})
-    return float(np.exp(nearest.x))
+    # half-way to its neighbours and closer, from its poses; then the minimum of a parabola
+    step = (coarse[1] - coarse[0]) / 4
+    fine = coarse[best] + step * np.arange(-3, 4)
+    costs = np.array([explained(at, poses[best])[0] for at in fine])
+    k = min(max(int(costs.argmin()), 1), len(fine) - 2)
+    left, middle, right = costs[k - 1 : k + 2]
+    shift = 0.5 * (left - right) / max(left - 2 * middle + right, 1e-9)
+    return float(np.exp(fine[k] + step * np.clip(shift, -1.0, 1.0)))
 
 
 def points(body: ConeBody, pose: Float) -> Float:
