@@ -340,9 +340,9 @@ def stature(rig: Rig, seen: Float) -> float | None:
     # half-way to its neighbours and closer, from its poses; then the minimum of a parabola
     step = (coarse[1] - coarse[0]) / 4
     fine = coarse[best] + step * np.arange(-3, 4)
-    costs = np.array([explained(at, poses[best])[0] for at in fine])
-    k = min(max(int(costs.argmin()), 1), len(fine) - 2)
-    left, middle, right = costs[k - 1 : k + 2]
+    finer = [explained(at, poses[best])[0] for at in fine]
+    k = min(max(int(np.argmin(finer)), 1), len(fine) - 2)
+    left, middle, right = finer[k - 1 : k + 2]
     shift = 0.5 * (left - right) / max(left - 2 * middle + right, 1e-9)
     return float(np.exp(fine[k] + step * np.clip(shift, -1.0, 1.0)))
 
