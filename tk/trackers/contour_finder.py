@@ -135,6 +135,7 @@ class ContourFinder:
         self._body: ConeBody | None = None
         self._begun: _Begun | None = None  # what :meth:`anticipate` has found
         self._cues: tuple[tuple[object, ...], list[Cue]] = ((None,), [])  # the last ones, and what they are of
+        self._marked: tuple[Float, float | None] = np.empty(0), None  # landmarks, and the stature that they show
         self.colors: PartColors
         self.limbs: tuple[Limb, ...]
 
@@ -316,6 +317,13 @@ class ContourFinder:
         found = frame.ask(self.world.points_out(landmarks.points(self.body, pose)))
         marked = landmarks.of_person(None if found is None else found[None], pyramid.masks[0])
         return None if marked is None else replace(pyramid, measured={**pyramid.measured, landmarks.NAME: marked})
+
+    def marked_stature(self, seen: Float) -> float | None:
+        """Return the stature that landmarks (V, L, 4) show, see :func:`~tk.model.cues.landmarks.stature`; a start asks
+        for that of one frame several times."""
+        if not np.array_equal(self._marked[0], seen, equal_nan=True):
+            self._marked = seen, landmarks.stature(self.views.rig, seen)
+        return self._marked[1]
 
     def sighted(self, seen: Float) -> RenderedBody | None:
         """Return the average body on the grid :attr:`fine_grid`, at the pose that a person's landmarks (V, L, 4) show;

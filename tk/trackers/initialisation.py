@@ -230,7 +230,7 @@ def stature_of(finder: ContourFinder, pyramids: Sequence[Pyramid], hull_m: float
     """
     rig = finder.views.rig
     marked = [pyramid.measured[landmark_cue.NAME] for pyramid in pyramids if landmark_cue.NAME in pyramid.measured]
-    if marked and (shown := landmark_cue.stature(rig, max(marked, key=lambda seen: np.nansum(seen[..., 2])))):
+    if marked and (shown := finder.marked_stature(max(marked, key=lambda seen: np.nansum(seen[..., 2])))):
         return shown
     body: ConeBody = build_cone_body(AVERAGE_BODY)
     ratios: list[Float] = []
