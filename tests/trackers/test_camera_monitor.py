@@ -388,7 +388,7 @@ def test_sigma_counts_what_the_test_of_the_opening_tolerates(scene: Scene, monke
         estimate, _ = monitor.step(blind([2, 3], range(FRAMES))(scene.frames[0]))
         assert estimate.sigma is not None
         sigma.append(np.median(estimate.sigma))
-    assert sigma[1] > 1.3 * sigma[0]
+    assert np.sqrt(sigma[1] ** 2 - sigma[0] ** 2) > 0.02  # half of it: each joint is seen by two segments and views
 
 
 def test_person_whose_size_contradicts_the_given_height_is_refused(scene: Scene) -> None:

@@ -20,11 +20,14 @@ from tests.trackers.test_region import (
     with_arm,
 )
 from tests.trackers.walker import BODY, NAMES, errors, observe
+from tk.kernels.silhouette import normal_equations
 from tk.model.body.limb_candidates import exchanged_limbs, pairs, turned
 from tk.model.body.skeleton import JOINTS
-from tk.model.cues.landmarks import NAME
+from tk.model.cues.cue import CONTOUR_INFORMATION
+from tk.model.cues.landmarks import NAME, LandmarkCue
 from tk.model.cues.landmarks import points as landmark_places
 from tk.trackers.headings import both_headings, trajectory_cost, turned_pose
+from tk.trackers.second_pass import NEAR_DEG
 
 
 def seen_at(pose: np.ndarray, noise_m: float = 0.03) -> np.ndarray:
@@ -99,6 +102,24 @@ def test_landmarks_that_the_silhouettes_deny_enlarge_sigma_and_do_not_move_the_a
     assert plain.sigma is not None and denied.sigma is not None
     for wrist in ("wrist_l", "wrist_r"):
         assert denied.sigma[JOINTS.index(wrist)] > 0.1 > plain.sigma[JOINTS.index(wrist)]
+
+
+def test_for_sigma_landmarks_count_once_and_contours_not_along_themselves() -> None:
+    """With displaced contours as unknowns; in a step landmarks have a weight in place of these."""
+    tracker = tracker_at(POSES[0])
+    pose = tracker.world.poses_in(POSES[:1])
+    prior = tracker.prior(pose, NEAR_DEG)
+    alone, marked = (
+        tracker.pyramid(replace(observe(MASKS[0]), landmarks=landmarks)) for landmarks in (None, seen_at(POSES[0]))
+    )
+    cue = LandmarkCue(tracker.views.rig, tracker.body, marked.measured[NAME]).normal(pose).matrix
+    for view_m, weight in ((0.0, LandmarkCue.weight), (0.003, 1.0)):
+        by_landmarks = np.subtract(*(tracker.equations(seen, pose, prior, view_m)[0] for seen in (marked, alone)))
+        np.testing.assert_allclose(by_landmarks, weight * cue, rtol=0, atol=1e-6 * weight * np.abs(cue).max())
+    across = replace(tracker.line_search, tangential=0.0)
+    contours = normal_equations(tracker.body.arrays, tracker.views.at(alone, 0), pose, across).hessian
+    firm = tracker.equations(alone, pose, prior, 1e-7)[0] - CONTOUR_INFORMATION * prior.matrix
+    np.testing.assert_allclose(firm, CONTOUR_INFORMATION * contours, rtol=0, atol=1e-4 * np.abs(firm).max())
 
 
 def test_estimate_has_the_landmarks_of_its_person() -> None:

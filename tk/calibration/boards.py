@@ -30,6 +30,8 @@ _RADIUS = 0.36
 APRIL_BORDER = 2
 #: sides that a person can carry and print, metres
 _LEAST_M, _MOST_M = 0.004, 0.5
+#: most columns or rows
+_MOST = 40
 
 
 @dataclass(frozen=True)
@@ -216,8 +218,8 @@ def make_board(
 def _size(kind: str, size: str | None) -> tuple[int, int]:
     if size is None:
         return KINDS[kind]
-    match = re.fullmatch(r"\s*(\d\d?)\s*[x×*]\s*(\d\d?)\s*", size)
-    if match is None or min(map(int, match.groups())) < 2:
+    match = re.fullmatch(r"\s*(\d{1,4})\s*[x×*]\s*(\d{1,4})\s*", size)
+    if match is None or not all(2 <= int(n) <= _MOST for n in match.groups()):
         raise ConfigError(f"--size {size}: give columns and rows of the board's squares, for example 7x5")
     columns, rows = int(match[1]), int(match[2])
     if kind in ("charuco", "chessboard") and min(columns, rows) < 3:

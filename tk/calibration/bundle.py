@@ -22,8 +22,8 @@ Float = NDArray[np.float64]
 _HELD = 1e14
 #: Cauchy's scale in standard deviations: its 95 % efficiency on normal noise
 _CAUCHY = 2.385
-#: relative decrease of the cost below which the iterations end
-_ENOUGH = 1e-7
+#: iterations, and relative decrease of the cost below which they end
+_MOST_ROUNDS, _ENOUGH = 60, 1e-7
 #: time between the images of one instant, frames: synchronised videos are within half a frame of each other
 UNSYNCHRONISED = 0.29  # standard deviation of a uniform distribution of that width
 #: least share of a part's information about its focal length that the other unknowns do not explain
@@ -166,7 +166,7 @@ def adjust(start: State, views: Sequence[View], noise_px: float = 1.0) -> Solved
 
 def _descend(problem: _Problem, state: State, noise_px: float) -> State:
     damping, cost = 1e-3, problem.cost(state, noise_px)
-    while True:
+    for _ in range(_MOST_ROUNDS):
         equations = problem.equations(state, noise_px)
         while True:
             try:
@@ -182,7 +182,8 @@ def _descend(problem: _Problem, state: State, noise_px: float) -> State:
         done = cost - new < _ENOUGH * max(cost, 1e-9)
         state, cost, damping = moved, new, max(damping / 8, 1e-9)
         if done:
-            return state
+            break
+    return state
 
 
 def _noise(problem: _Problem, state: State) -> float:

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from tk.calibration.boards import Board
 from tk.calibration.bundle import State
-from tk.calibration.poses import IDENTITY, Pose
+from tk.calibration.poses import Pose
 from tk.errors import CalibrationError
-from tk.io.importers.readings import Y_UP
 
 Float = NDArray[np.float64]
 
@@ -23,7 +22,7 @@ _ABOVE_M = 0.4
 #: largest median sine of the angle between cameras and the floor
 _LEVEL = 0.09
 #: z of the world is up, out of the printed side: OpenCV's board has z into the paper
-_FLOOR = Pose(Y_UP, IDENTITY.translation)
+_FLOOR = Pose(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ClockError
-from tk.synchronise.person import NEAR_S
 from tk.synchronise.raw import Recording
 from tk.synchronise.ties import OUTLIER_SIGMA, SOUND_SIGMA_S, Clocks, Tie, connected_to, solve
 
@@ -20,6 +19,8 @@ Float = NDArray[np.float64]
 METHODS = ("cameras", "flash", "person", "sound", "timecode")
 #: names of the methods in tables
 SHOWN = {"cameras": "motion, known cameras", "person": "motion"}
+#: seconds above which sound and pictures are not of one recording
+_OTHER_S = 0.25
 #: seconds after which timecode begins again with 0
 _DAY_S = 86400.0
 
@@ -69,10 +70,9 @@ def decide(recordings: Sequence[Recording], ties: Sequence[Tie], reasons: dict[i
                     )
     seen = [tie for kind in pictures for tie in by_kind[kind]]
     for c, apart, sigma in _differences(recordings, by_kind["sound"], seen):
-        sigma = float(np.hypot(sigma, SOUND_SIGMA_S))
-        if abs(apart) > NEAR_S + OUTLIER_SIGMA * sigma:
+        if abs(apart) > _OTHER_S + 3 * sigma:
             unsure[c] = f"its sound and its pictures contradict each other by {_seconds(apart)}"
-        elif abs(apart) > OUTLIER_SIGMA * sigma:
+        elif abs(apart) > OUTLIER_SIGMA * np.hypot(sigma, SOUND_SIGMA_S):
             notes.append(
                 f"{recordings[c].where}: its sound is {_seconds(abs(apart))} {'late' if apart > 0 else 'early'}, more "
                 f"than the way of the sound and devices explain; the pictures decide"

@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.synchronise.looks import DIFFERS, GRID_HZ, SOMEBODY, Look
-from tk.synchronise.raw import SHORTEST_S
 from tk.synchronise.ties import Clocks
 
 Float = NDArray[np.float64]
 
-#: seconds that are left off at each end of the empty part
-_MARGIN_S = 0.2
+#: least length of the empty part, and what is left off at each end, seconds
+_LEAST_S, _MARGIN_S = 1.5, 0.2
 #: images with motion that are compared with the still one; share of them that must show the outline
 _SAMPLES, _CLEAR = 24, 0.8
 #: by how much stronger the outline is in the images with motion than in the still one
@@ -32,7 +31,7 @@ def find_empty(looks: Sequence[Look], clocks: Clocks) -> tuple[float, float] | N
     begin = max(clocks.common(c, float(look.times_s[0])) for c, look in enumerate(looks))
     end = min(clocks.common(c, float(look.times_s[-1])) for c, look in enumerate(looks))
     clock = np.arange(begin, end, 1 / GRID_HZ)
-    if len(clock) < 2 * SHORTEST_S * GRID_HZ:
+    if len(clock) < 2 * _LEAST_S * GRID_HZ:
         return None
     moving = np.zeros(len(clock), np.bool_)
     for c, look in enumerate(looks):
@@ -43,7 +42,7 @@ def find_empty(looks: Sequence[Look], clocks: Clocks) -> tuple[float, float] | N
         return None
     for first, end in runs(~moving):
         start, stop = clock[first] + _MARGIN_S, clock[end - 1] - _MARGIN_S
-        if stop - start >= SHORTEST_S and all(
+        if stop - start >= _LEAST_S and all(
             _is_empty(look, (np.array([start, stop]) - clocks.offsets_s[c]) / clocks.rates[c])
             for c, look in enumerate(looks)
         ):

@@ -12,13 +12,14 @@ from tk.model.cameras.camera import Camera
 from tk.model.cameras.common_view import closest_to_lines
 from tk.synchronise.looks import Look
 from tk.synchronise.person import rays_of
-from tk.synchronise.raw import SHORTEST_S
 from tk.synchronise.ties import Tie, solve
 
 Float = NDArray[np.float64]
 
 #: speed of sound in air, m/s
 SOUND_M_S = 343.0
+#: seconds about a sound in which its source is searched for: several steps
+_ABOUT_S = 2.0
 
 
 def without_travel_time(ties: Sequence[Tie], cameras: Sequence[Camera], looks: Sequence[Look]) -> list[Tie]:
@@ -56,7 +57,7 @@ def _motion(look: Look, camera: Camera) -> Float:
 
 def _ray(moves: Float, away_s: Float) -> Float:
     """Return the direction (3,) to what moves about a time, else at any time; NaN if nothing moves or it is unknown."""
-    near = moves[np.abs(away_s) < SHORTEST_S].sum(axis=0)
+    near = moves[np.abs(away_s) < _ABOUT_S].sum(axis=0)
     ray = near if near.any() else moves.sum(axis=0)
     length = float(np.linalg.norm(ray))
     return ray / length if length > 0 and np.isfinite(away_s).all() else np.full(3, np.nan)

@@ -47,8 +47,8 @@ ANCHORS, CLEAR = 4, 0.2
 # seconds.
 FOLLOWED = 8
 # A given height is refused if the stature that the frames show differs by more than this factor. With true heights the
-# factor is 0.955 to 1.077 by the areas in nine recordings, and 0.88 to 1.00 by the landmarks in 42 single frames;
-# children's proportions and wide clothes need more. A visual hull that is lower by more than this shows a person who
+# factor is 0.955 to 1.077 by the areas in nine recordings, and 0.88 to 1.01 by the landmarks in 14 frames; children's
+# proportions and wide clothes need more. A visual hull that is lower by more than this shows a person who
 # bends, so its height is no estimate of the stature.
 MOST_STATURE_RATIO = 1.35
 #: the joints that a limb search does not move

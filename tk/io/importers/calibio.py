@@ -25,7 +25,7 @@ _LENS = "libCalib::CameraModelOpenCV"
 _DISTORTIONS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
 
 #: bit of a `polymorphic_id` with which the file gives the name of a model; later cameras refer to the number alone
-_NAMED = 0x80000000
+_NAMED = 1 << 31
 
 
 def _read(files: Sequence[Path]) -> Tables:

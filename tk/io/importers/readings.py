@@ -25,9 +25,9 @@ Reading = Callable[[Float, Float], tuple[Float, Float]]
 Y_UP = np.diag([1.0, -1.0, -1.0])
 
 #: degrees between a camera's axis and the direction to the place that all cameras look at, root mean square: half the
-#: field of view of a wide lens. The first reading is replaced if it has more, and another one half as much.
-#: So has one that replaces the first one because its cameras are upright: poses that are read in a wrong way may by
-#: chance look at one place, but not upright.
+#: field of view of a wide lens. The first reading is replaced if it has more, by one that has half as much. It is also
+#: replaced if its cameras are not upright, by one whose cameras are, and that has less than half of this: poses that
+#: are read in a wrong way may by chance look at one place, but not upright.
 _APART_DEG = 45.0
 
 

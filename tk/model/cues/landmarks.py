@@ -298,8 +298,9 @@ def propose(rig: Rig, body: ConeBody, seen: Float, p_near: Float) -> Float:
 def _descended(cue: LandmarkCue, rest: Float) -> tuple[Float, Float]:
     """Return poses (B, D) that the landmarks attract from poses (B, D), and their costs (B,), nats.
 
-    Levenberg-Marquardt, with a weak prior about the first poses. Which landmarks are right, and whose left is left,
-    changes with the pose, so that full steps often lead uphill: they are not made, and the next ones are shorter.
+    Levenberg-Marquardt (Marquardt 1963), with a weak prior about the first poses. Which landmarks are right, and whose
+    left is left, changes with the pose, so that full steps often lead uphill: they are not made, and the next ones are
+    shorter.
     """
     skeleton = cue.body.skeleton
     precision = np.where(skeleton.prismatic, 1.0, np.pi) ** -2.0
@@ -337,14 +338,14 @@ def stature(rig: Rig, seen: Float) -> float | None:
     coarse = np.linspace(np.log(LEAST_STATURE), np.log(GREATEST_STATURE), STATURES)
     costs, poses = zip(*map(explained, coarse), strict=True)
     best = int(np.argmin(costs))
-    # half-way to its neighbours and closer, from its poses; then the minimum of a parabola
+    # up to three quarters of the way to its neighbours, from its poses; then the minimum of a parabola
     step = (coarse[1] - coarse[0]) / 4
     fine = coarse[best] + step * np.arange(-3, 4)
     finer = [explained(at, poses[best])[0] for at in fine]
     k = min(max(int(np.argmin(finer)), 1), len(fine) - 2)
     left, middle, right = finer[k - 1 : k + 2]
     shift = 0.5 * (left - right) / max(left - 2 * middle + right, 1e-9)
-    return float(np.exp(fine[k] + step * np.clip(shift, -1.0, 1.0)))
+    return float(np.exp(np.clip(fine[k] + step * np.clip(shift, -1.0, 1.0), coarse[0], coarse[-1])))
 
 
 def points(body: ConeBody, pose: Float) -> Float:
